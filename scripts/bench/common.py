@@ -90,14 +90,11 @@ def run_once(folder: Path, command: str, *words: str, result: str = "metrics.jso
     return folder
 
 
-def train_seeds(
-    experiment: str, seeds: Sequence[int], jobs: int, overrides: Sequence[str], parent: Path
-) -> list[Path]:
-    """Train an experiment with each of `seeds` in `parent`/<seed>, `jobs` at a time; return the folders."""
+def train_seeds(seeds: Sequence[int], jobs: int, overrides: Sequence[str], parent: Path) -> list[Path]:
+    """Train with each of `seeds` in `parent`/<seed>, `jobs` at a time; return the folders."""
 
     def train(seed: int) -> Path:
-        words = (f"experiment={experiment}", f"seed={seed}", *overrides)
-        return run_once(parent / str(seed), "train", *words)
+        return run_once(parent / str(seed), "train", f"seed={seed}", *overrides)
 
     return in_parallel(train, seeds, jobs)
 

@@ -1,22 +1,25 @@
 #!/usr/bin/env python
 """How well, and how fast, does each experiment learn? Rows of docs/results/learning.md.
 
-    scripts/bench/learning.py medium large --seeds 10 --jobs 2 --json learning.json
+    scripts/bench/learning.py medium large --seeds 10 --jobs 2 --json docs/results/data/learning.json
 
-Trains `--seeds` agents of each experiment of conf/experiment and judges every last checkpoint. Further
-words are passed to cartpole-train as overrides. The runs are in runs/bench/<experiment>/<seed>, with
-`--device cuda` in runs/bench/<experiment>_cuda/<seed>; one that exists is not trained again.
+Trains `--seeds` agents of each experiment of conf/experiment, and of a stepper cart at 10 ms, and judges
+every last checkpoint. Further words are passed to cartpole-train as overrides. The runs are in
+runs/bench/<experiment>/<seed>, with `--device cuda` in runs/bench/<experiment>_cuda/<seed>; one that exists
+is not trained again. The other experiments of a JSON file that exists are kept.
 
 A fraction is the mean score over 100 starts on the nominal simulated cart, divided by the best score that
 scripts/bench/reference.py found there (references.json). `drawn` is the mean score on a thousand carts of
-randomization=wide, each driven once; `failed` is the share of them with a score below 500. Seconds include
+randomization=wide (of the stepper's, for it), each driven once; `failed` is the share of them with a score
+below 500. `end` is the last evaluation over the best one of the last third of the training. Seconds include
 compilation, collection, learning and evaluation.
 """
 
 import argparse
 import json
+import math
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from common import (
@@ -27,6 +30,7 @@ from common import (
     min_median_max,
     option_parser,
     print_table,
+    read_json,
     reference_scores,
     train_seeds,
     write_json,
@@ -43,28 +47,39 @@ from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.build import TrainedAgent, trained_agent, use_threads
 from cartpole_rl.workflows.config import TrainConfig
 
-EXPERIMENTS = {  # the plants on which each experiment's agents are judged
-    "medium": ("medium",),
-    "large": ("large",),
-    "both": ("medium", "large"),
-    "both_blind": ("medium", "large"),
-    "range": tuple(f"{length:.1f} m" for length in np.arange(0.2, 1.01, 0.1)),
-    "balance": ("medium",),
-    "recurrent": ("medium",),
+
+class Learnt(NamedTuple):
+    """The poles on which agents are judged, what is chosen for their training, and their drawn carts."""
+
+    plants: tuple[str, ...]
+    words: tuple[str, ...] = ()  # instead of experiment=<name>
+    randomization: str = "wide"
+
+
+STEPPER = ("cart=stepper", "pole=rod_03", "control_period=0.01", "actions=nine_levels_fine")
+EXPERIMENTS = {
+    "medium": Learnt(("medium",)),
+    "large": Learnt(("large",)),
+    "both": Learnt(("medium", "large")),
+    "both_blind": Learnt(("medium", "large")),
+    "range": Learnt(tuple(f"{length:.1f} m" for length in np.arange(0.2, 1.01, 0.1))),
+    "balance": Learnt(("medium",)),
+    "recurrent": Learnt(("medium",)),
+    "stepper": Learnt(("rod_03",), (*STEPPER, "randomization=stepper"), "stepper"),
 }
 REACHED, KEPT = 0.9, 0.85  # fractions: the first marks when learning succeeded, the second whether it lasted
 STARTS, DRAWN_CARTS = 100, 1000
 
 
-def judge(folder: Path, plant: str) -> dict[str, float]:
+def judge(folder: Path, plant: str, randomization: str) -> dict[str, float]:
     """Return the last checkpoint's scores with the pole `plant`, on the nominal cart and on drawn ones."""
     agent = trained_agent(folder)
     nominal = agent.training.model_copy(
         update={"randomization": {}, "pole": pole(plant, agent.training.pole)}
     )
-    wide = {name: Range(**line) for name, line in choice("randomization/wide").items()}
+    ranges = {name: Range(**line) for name, line in choice(f"randomization/{randomization}").items()}
     episodes = run_agent(agent, nominal, STARTS)
-    drawn = scores(run_agent(agent, nominal.model_copy(update={"randomization": wide}), DRAWN_CARTS))
+    drawn = scores(run_agent(agent, nominal.model_copy(update={"randomization": ranges}), DRAWN_CARTS))
     return {
         "score": float(scores(episodes).mean()),
         "score_upright": float(np.mean([episode.score_upright.sum() for episode in episodes])),
@@ -95,16 +110,19 @@ def pole(plant: str, trained: PoleSettings) -> PoleSettings:
 def seed_result(experiment: str, folder: Path, references: dict[str, float]) -> dict[str, Any]:
     """Return the figures of one seed."""
     history = [json.loads(line) for line in (folder / "history.jsonl").read_text().splitlines()]
-    plants = EXPERIMENTS[experiment]
-    judged = {plant: judge(folder, plant) for plant in plants}
+    plants, _, randomization = EXPERIMENTS[experiment]
+    judged = {plant: judge(folder, plant, randomization) for plant in plants}
     reference = float(np.mean([references[plant] for plant in plants]))
     fractions = [record["score"] / reference for record in history]
+    measure = "score_upright" if experiment == "balance" else "score"
+    ends = [record[measure] for record in history[-math.ceil(len(history) / 3) :]]
     first = next((index for index, fraction in enumerate(fractions) if fraction >= REACHED), None)
     later = [] if first is None else fractions[first + 1 :]
     return {
         "seconds": history[-1]["seconds"],
         "seconds_to_reached": None if first is None else history[first]["seconds"],
         "transitions_to_reached": None if first is None else history[first]["transitions"],
+        "end": ends[-1] / max(ends),
         "kept": float(np.mean([fraction > KEPT for fraction in later])) if later else None,
         "plants": {
             plant: {**figures, "fraction": figures["score"] / references[plant]}
@@ -118,12 +136,13 @@ def summary(experiment: str, results: list[dict[str, Any]]) -> list[dict[str, st
     balance = experiment == "balance"
     figures = {
         f"{key}, {plant}": [each["plants"][plant][key] for each in results]
-        for plant in EXPERIMENTS[experiment]
+        for plant in EXPERIMENTS[experiment].plants
         for key in (("score_upright",) if balance else ("fraction", "score", "drawn", "failed"))
     }
     if not balance:
         figures["seconds to 0.9"] = [each["seconds_to_reached"] or float("inf") for each in results]
         figures["kept over 0.85"] = [each["kept"] or 0.0 for each in results]
+        figures["last / best of the last third"] = [each["end"] for each in results]
     figures["seconds"] = [each["seconds"] for each in results]
     return [
         {"experiment": experiment, "figure": name, "seeds": str(len(values))}
@@ -148,14 +167,15 @@ def main() -> None:
     """Train, judge, print a table and write the figures."""
     options, overrides = parse_options()
     use_threads(1)
-    references, device = reference_scores(), options.device
-    everything, rows = {}, []
+    references, device, rows = reference_scores(), options.device, []
+    everything = read_json(options.json) if options.json and options.json.exists() else {}
     for experiment in options.experiments:
         parent = RUNS / (experiment if device == "cpu" else f"{experiment}_{device}")
-        words = [f"device={device}", *overrides]
-        folders = train_seeds(experiment, chosen_seeds(options), options.jobs, words, parent)
+        chosen = EXPERIMENTS[experiment].words or (f"experiment={experiment}",)
+        words = [*chosen, f"device={device}", *overrides]
+        folders = train_seeds(chosen_seeds(options), options.jobs, words, parent)
         results = [seed_result(experiment, folder, references) for folder in folders]
-        everything[experiment] = dict(zip(chosen_seeds(options), results, strict=True))
+        everything[experiment] = dict(zip(map(str, chosen_seeds(options)), results, strict=True))
         rows += summary(experiment, results)
         print_table(rows)
     write_json(options.json, everything)

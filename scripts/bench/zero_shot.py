@@ -90,7 +90,7 @@ def episode_score(env: CartPoleEnv, policy: Policy, truth: Truth) -> float | Non
     except PlantError as error:  # high friction can prevent homing
         print(f"not driven: {error}; {json.dumps(truth)}", flush=True)
         return None
-    return float(episode.score.sum())
+    return round(float(episode.score.sum()), 1)
 
 
 def drive_missing(
@@ -109,14 +109,13 @@ def drive_missing(
 # figures
 
 
-def cart_figures(number: int, truth: Truth, reference: float | None, scores: Scores) -> dict[str, Any]:
+def cart_figures(number: int, reference: float | None, scores: Scores) -> dict[str, Any]:
     """Return the figures of one cart; `score` and `fraction` are None where they are not known."""
     driven = [score for score in scores if score is not None]
     score = float(np.mean(driven)) if driven else None
     known = reference is not None and score is not None
     return {
         "cart": number,
-        "truth": truth,
         "reference": reference,
         "scores": scores,
         "score": score,
@@ -145,15 +144,12 @@ def agent_figures(run: str, carts: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def all_figures(driven: Driven, truths: list[Truth], references: list[float | None]) -> list[dict[str, Any]]:
+def all_figures(driven: Driven, references: list[float | None]) -> list[dict[str, Any]]:
     """Return the figures of every agent."""
     return [
         agent_figures(
             run,
-            [
-                cart_figures(number, truths[number], references[number], carts[number])
-                for number in sorted(carts)
-            ],
+            [cart_figures(number, references[number], carts[number]) for number in sorted(carts)],
         )
         for run, carts in driven.items()
     ]
@@ -238,8 +234,8 @@ def main() -> None:
     driven |= earlier_scores(options.json, options_of_draw, options.truths)
     for run, number in drive_missing(driven, options.runs, truths, options.starts, options.jobs):
         print(f"{run}, cart {number}: {driven[run][number]}", flush=True)
-        write_json(options.json, {**options_of_draw, "agents": all_figures(driven, truths, references)})
-    agents = all_figures(driven, truths, references)
+        write_json(options.json, {**options_of_draw, "agents": all_figures(driven, references)})
+    agents = all_figures(driven, references)
     write_json(options.json, {**options_of_draw, "agents": agents})
     print_table([agent_row(agent) for agent in agents])
     print()

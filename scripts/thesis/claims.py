@@ -1,5 +1,5 @@
 #!/usr/bin/env python
-"""Hold the thesis's claims (claims.yaml) against the stored results; rewrite the tables of the pages.
+"""Hold the claims (claims.yaml) against the stored results; rewrite the tables of the pages.
 
     scripts/thesis/claims.py
 
@@ -11,12 +11,15 @@ evaluations of each agent, `ratio` that of the second to the first, `a&b` the lo
 several; names with @ are numbers of an agent's curves (CURVES), `a#key` is a number of metrics.json or
 identification.json that `report.py --data` stores (reading.BEHAVIOUR). In a text `{iqm arm/evaluation}` is
 replaced by that number, `{iqm arm/evaluation []}` by it with its 95 % interval, `{claim}` by the statistics
-of the row's statements with theirs.
+of the row's statements with theirs. `{seeds NAME}` is replaced by the number of seeds, a cell's border, and
+their minimum, median and maximum. The benches' files in docs/results/data give further names: see
+`bench_values`.
 
 A statement is a statistic (STATISTICS) with its values, an operator and a number, as
 `difference position/emulated constant/emulated > 0`.
 """
 
+import json
 import re
 import sys
 from collections import Counter
@@ -24,7 +27,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from enum import StrEnum
 from pathlib import Path
 from textwrap import fill
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
@@ -50,8 +53,9 @@ from cartpole_rl.settings import Settings
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 DATA = CHECKOUT / "docs/results/thesis"
+BENCHES = CHECKOUT / "docs/results/data"
 CLAIMS = Path(__file__).with_name("claims.yaml")
-PAGES = ("README.md", "docs/thesis.md", "docs/thesis-results.md")
+PAGES = ("README.md", "docs/thesis.md", "docs/thesis-results.md", "docs/results/learning.md")
 BLOCK = re.compile(r"(<!-- claims: (\w+) -->\n)((?:.+\n)*)")
 FORMULA = re.compile(r"\{([^{}]+)\}")
 WIDTH = 120  # characters of a line of text
@@ -152,6 +156,7 @@ def _wider(values: Array, others: Array) -> Estimate:
 STATISTICS: Mapping[str, tuple[str, Callable[..., Estimate]]] = {  # name: in words, function
     "iqm": ("", estimate),
     "mean": ("mean", _mean),
+    "median": ("median", lambda values: _exact(np.median(values), values.size)),
     "most": ("best agent", lambda values: _exact(values.max(), values.size)),
     "least": ("worst agent", lambda values: _exact(values.min(), values.size)),
     "apart": (
@@ -187,11 +192,16 @@ def _word(found: Estimate, operator: str, number: float) -> Word:
 class Evidence:
     """The stored results, as values of agents by name."""
 
-    def __init__(self, results: Mapping[str, StudyResults]) -> None:
+    def __init__(
+        self, results: Mapping[str, StudyResults], benches: Mapping[str, Array] | None = None
+    ) -> None:
         self.results = results
+        self.benches = benches or {}
 
     def values(self, name: str, study: str = "") -> Array:
         """Return the values of "study/arm/evaluation" or "arm/evaluation" [agents]. Raises ConfigError."""
+        if name in self.benches:
+            return self.benches[name]
         *above, arms, evaluation = name.split("/")
         study = above[0] if above else study
         try:
@@ -244,6 +254,8 @@ class Evidence:
             if row and match[1] == "claim":
                 return ", ".join(each.text for each in self.statements(row))
             words = match[1].removesuffix(" []").split()
+            if words[0] == "seeds":
+                return _of_seeds(self.values(words[1]))
             found = self.statistic(words, row.study if row else "")
             if match[1].endswith(" []"):
                 return _with_interval(words[0], found)
@@ -298,6 +310,47 @@ def _with_interval(name: str, found: Estimate) -> str:
     if name == "over":
         return f"{_count(found)} [{100 * found.low:.0f}, {100 * found.high:.0f} %]"
     return f"{number_text(found.value)} [{number_text(found.low)}, {number_text(found.high)}]"
+
+
+def _of_seeds(values: Array) -> str:
+    """Return two cells of a table: how many seeds, and their minimum, median and maximum."""
+    decimals = 0 if values.max() >= 2 or (values == values.round()).all() else 3
+    numbers = ", ".join(f"{each:.{decimals}f}" for each in (values.min(), np.median(values), values.max()))
+    return f"{values.size} | {numbers}"
+
+
+def bench_values(folder: Path = BENCHES) -> dict[str, Array]:
+    """Return the values of the benches' agents: learning/medium/failed, learning/range/1.0_m/fraction.
+
+    A file of learning.py has experiments, with the figures of each seed and of each of its poles; one of
+    zero_shot.py a list of agents; one of fine_tuning.py a list of carts, whose means count for each agent.
+    """
+    found: dict[str, list[float]] = {}
+
+    def add(name: str, figures: Mapping[str, Any]) -> None:
+        for key, value in figures.items():
+            if isinstance(value, Mapping):
+                add(f"{name}/{key.replace(' ', '_')}", value)
+            elif isinstance(value, int | float):
+                found.setdefault(f"{name}/{key}", []).append(float(value))
+
+    for file in sorted(folder.glob("*.json")):
+        content = json.loads(file.read_text(encoding="utf-8"))
+        if isinstance(content, list):
+            for agent in dict.fromkeys(each["agent"] for each in content):
+                for stage in ("before", "after"):
+                    carts = [each["fraction"][stage] for each in content if each["agent"] == agent]
+                    add(file.stem, {stage: float(np.mean(carts))})
+        elif "agents" in content:
+            for figures in content["agents"]:
+                add(file.stem, figures)
+        else:
+            for experiment, seeds in content.items():
+                for figures in seeds.values():
+                    plants = figures["plants"]
+                    own = next(iter(plants.values())) if len(plants) == 1 else plants
+                    add(f"{file.stem}/{experiment}", {**figures, "plants": None, **own})
+    return {name: np.array(values) for name, values in found.items()}
 
 
 def read_claims(file: Path = CLAIMS) -> Claims:
@@ -378,7 +431,7 @@ def rebuilt(page: str, contents: Mapping[str, str]) -> str:
 
 def stored() -> Evidence:
     """Return the stored results."""
-    return Evidence({each.name: each for each in read_studies(DATA) if each.agents})
+    return Evidence({each.name: each for each in read_studies(DATA) if each.agents}, bench_values())
 
 
 def rebuild_pages() -> None:
