@@ -48,7 +48,7 @@ from cartpole_rl.workflows.build import TrainedAgent, trained_agent, use_threads
 from cartpole_rl.workflows.config import TrainConfig
 
 
-class Learnt(NamedTuple):
+class Experiment(NamedTuple):
     """The poles on which agents are judged, what is chosen for their training, and their drawn carts."""
 
     plants: tuple[str, ...]
@@ -58,14 +58,14 @@ class Learnt(NamedTuple):
 
 STEPPER = ("cart=stepper", "pole=rod_03", "control_period=0.01", "actions=nine_levels_fine")
 EXPERIMENTS = {
-    "medium": Learnt(("medium",)),
-    "large": Learnt(("large",)),
-    "both": Learnt(("medium", "large")),
-    "both_blind": Learnt(("medium", "large")),
-    "range": Learnt(tuple(f"{length:.1f} m" for length in np.arange(0.2, 1.01, 0.1))),
-    "balance": Learnt(("medium",)),
-    "recurrent": Learnt(("medium",)),
-    "stepper": Learnt(("rod_03",), (*STEPPER, "randomization=stepper"), "stepper"),
+    "medium": Experiment(("medium",)),
+    "large": Experiment(("large",)),
+    "both": Experiment(("medium", "large")),
+    "both_blind": Experiment(("medium", "large")),
+    "range": Experiment(tuple(f"{length:.1f} m" for length in np.arange(0.2, 1.01, 0.1))),
+    "balance": Experiment(("medium",)),
+    "recurrent": Experiment(("medium",)),
+    "stepper": Experiment(("rod_03",), (*STEPPER, "randomization=stepper"), "stepper"),
 }
 REACHED, KEPT = 0.9, 0.85  # fractions: the first marks when learning succeeded, the second whether it lasted
 STARTS, DRAWN_CARTS = 100, 1000

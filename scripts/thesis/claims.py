@@ -323,7 +323,7 @@ def bench_values(folder: Path = BENCHES) -> dict[str, Array]:
     """Return the values of the benches' agents: learning/medium/failed, learning/range/1.0_m/fraction.
 
     A file of learning.py has experiments, with the figures of each seed and of each of its poles; one of
-    zero_shot.py a list of agents; one of fine_tuning.py a list of carts, whose means count for each agent.
+    zero_shot.py has a list of agents.
     """
     found: dict[str, list[float]] = {}
 
@@ -336,20 +336,15 @@ def bench_values(folder: Path = BENCHES) -> dict[str, Array]:
 
     for file in sorted(folder.glob("*.json")):
         content = json.loads(file.read_text(encoding="utf-8"))
-        if isinstance(content, list):
-            for agent in dict.fromkeys(each["agent"] for each in content):
-                for stage in ("before", "after"):
-                    carts = [each["fraction"][stage] for each in content if each["agent"] == agent]
-                    add(file.stem, {stage: float(np.mean(carts))})
-        elif "agents" in content:
+        if "agents" in content:
             for figures in content["agents"]:
                 add(file.stem, figures)
         else:
             for experiment, seeds in content.items():
                 for figures in seeds.values():
-                    plants = figures["plants"]
+                    plants = figures.pop("plants")
                     own = next(iter(plants.values())) if len(plants) == 1 else plants
-                    add(f"{file.stem}/{experiment}", {**figures, "plants": None, **own})
+                    add(f"{file.stem}/{experiment}", figures | own)
     return {name: np.array(values) for name, values in found.items()}
 
 

@@ -42,7 +42,8 @@ class Driven:
 
     def __init__(self, **settings: object) -> None:
         self.settings = truth(**COARSE | settings)
-        self.encoders = (self.settings.hardware or nominal_hardware()).encoders
+        self.rig = self.settings.hardware or nominal_hardware()
+        self.encoders = self.rig.encoders
         self.cart = CartDevice(self.settings)
         self.flags = Flags(0)
         self.newest = 0  # tick of the newest STATE
@@ -120,7 +121,7 @@ def homed_once(kind: str, settings: tuple[tuple[str, object], ...]) -> Driven:
 
 def check_homed(driven: Driven, state: State) -> None:
     """Check that the zeros are right within two counts and that cart and pole rest in place."""
-    assert driven.flags & ~(Flags.LEFT_SWITCH | Flags.RIGHT_SWITCH) == Flags.HOMED
+    assert driven.flags == Flags.HOMED | driven.rig.switches * Flags.LEFT_SWITCH
     assert state.fault == 0
     x, angle = driven.measured(state)
     assert x == pytest.approx(driven.x, abs=2 * driven.encoders.metres)

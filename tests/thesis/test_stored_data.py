@@ -4,18 +4,17 @@ import re
 from functools import cache
 
 import pytest
-from claims import PAGES, Evidence, Row, Word, bench_values, blocks, read_claims, rebuilt
+from claims import PAGES, Evidence, Row, Word, blocks, read_claims, rebuilt, stored
 from page import BEYOND
 from page_commands import ROOT
-from reading import read_studies
 from results import StudyResults
 from small_results import found
 from study import study_names
 
 BEYOND_IT = re.compile(r"(\| [^|]+ ){2,}\| `(?P<study>\w+)` \|")
 CLAIMS = read_claims()
-RESULTS = [each for each in read_studies(ROOT / "docs/results/thesis") if each.agents]
-EVIDENCE = Evidence({each.name: each for each in RESULTS}, bench_values())
+EVIDENCE = stored()
+RESULTS = [*EVIDENCE.results.values()]
 
 
 def test_every_study_has_results() -> None:

@@ -1,7 +1,8 @@
 """What is wrong with a cart, in words and each with its remedy: its refusals, its faults, its INFO.
 
 Positions, angles and forces are computed from the numbers of the cart's file: metres per count, counts per
-turn, the span of the track. A cart whose INFO has others is refused: every number would be wrong.
+turn, the span of the track. A cart that reports others is refused: every number would be wrong. So is one
+with other end switches: it would home against stops that are not there.
 """
 
 from cartpole_rl.errors import FaultError, LinkError, PlantError
@@ -92,27 +93,21 @@ def fault_error(bits: int) -> FaultError:
 
 
 def check_rig(information: Info, flags: Flags, hardware: Hardware) -> None:
-    """Raise NotReadyError if scales or end switches are not those of the cart's file, or the period is none.
+    """Raise NotReadyError if a cart is not the one of its file, or its period is impossible.
 
-    `flags` are those of a state of the cart.
+    Its scales and end switches are compared. `flags` are those of one of its states.
     """
-    expected = {
-        "cart_nanometres_per_count": hardware.cart_nanometres_per_count,
-        "pole_counts_per_turn": hardware.pole_counts_per_turn,
-        "left_switch": hardware.left_switch,
-        "right_switch": hardware.right_switch,
-    }
     reported = {
         "cart_nanometres_per_count": information.cart_nanometres_per_count,
         "pole_counts_per_turn": information.pole_counts_per_turn,
         "left_switch": int(Flags.LEFT_SWITCH in flags),
         "right_switch": int(Flags.RIGHT_SWITCH in flags),
     }
-    if other := [name for name in expected if reported[name] != expected[name]]:
+    if other := [name for name in reported if reported[name] != getattr(hardware, name)]:
         lines = ", ".join(f"`{name}: {reported[name]}`" for name in other)
         raise NotReadyError(
             "the cart reports "
-            + " and ".join(f"{name} {reported[name]}, not {expected[name]}" for name in other),
+            + " and ".join(f"{name} {reported[name]}, not {getattr(hardware, name)}" for name in other),
             f"if this is true, write {lines} into a file of this cart and give it with cart=; if not, build "
             "its firmware from the file (cartpole-export format=firmware)",
         )

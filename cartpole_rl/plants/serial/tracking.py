@@ -76,7 +76,7 @@ class StateTracker:
         """Forget the states of this connection; the cart may restart before the next one."""
         self._newest = self.last = self.stopped_clock = self.period_us = self.wrong_rate = None
         self.ticks_alone, self._same_frame, self._handed_out = False, 0, None
-        self._clocks = ClockComparison()
+        self.flags, self._clocks = Flags(0), ClockComparison()
         self._missing.clear()
 
     def receive(self, state: State, flags: Flags, arrived_at: float, sequence: int) -> bool:
