@@ -126,22 +126,22 @@ class CartPhysics:
     @property
     def x(self) -> float:
         """Cart position, m from the middle of the rail."""
-        return float(self._data.qpos[0])
+        return self._data.qpos.item(0)
 
     @property
     def x_dot(self) -> float:
         """Cart velocity, m/s."""
-        return float(self._data.qvel[0])
+        return self._data.qvel.item(0)
 
     @property
     def angle(self) -> float:
         """Pole angle, rad from the vertical, not wrapped."""
-        return float(self._data.qpos[1]) + self._settings.track_tilt
+        return self._data.qpos.item(1) + self._settings.track_tilt
 
     @property
     def angle_dot(self) -> float:
         """Pole angular velocity, rad/s."""
-        return float(self._data.qvel[1])
+        return self._data.qvel.item(1)
 
     def place(self, x: float, angle: float, angle_dot: float = 0.0) -> None:
         """Place the cart at x m, at rest, and the pole at an angle and angular velocity, rad and rad/s."""
@@ -166,17 +166,16 @@ class CartPhysics:
         step = seconds / steps
         self._model.opt.timestep = step
         drag, friction = self._settings.pole_drag, self._model.dof_frictionloss
-        applied, velocity = self._data.qfrc_applied, self._data.qvel
+        applied = self._data.qfrc_applied
         decay = self._motor.decay(step)
         target = self._enforce(motor)
         for number in range(1, steps + 1):
-            force = self._motor.step(target, decay) + self._cogging(self._data.qpos[0])
-            applied[0] = self._larger * force + self._held
-            applied[1] = -drag * velocity[1] * abs(velocity[1])
-            friction[0] = self._cart_friction(velocity[0])
-            speed = abs(velocity[0])
+            x_dot, angle_dot = self._data.qvel.tolist()
+            applied[0] = self._larger * (self._motor.step(target, decay) + self._cogging(self.x)) + self._held
+            applied[1] = -drag * angle_dot * abs(angle_dot)
+            friction[0] = self._cart_friction(x_dot)
             self._mj_step(self._model, self._data)
-            self._notice_contact(speed)
+            self._notice_contact(abs(x_dot))
             self._press_switches()
             if look is not None and (chosen := look(number * step)) != motor:
                 motor, target = chosen, self._enforce(chosen)
@@ -188,17 +187,18 @@ class CartPhysics:
 
     def _notice_contact(self, speed: float) -> None:
         """Report it if the cart, which ran at `speed` m/s, has just touched an end stop."""
-        touches = not self._left_stop < self._data.qpos[0] < self._right_stop
+        touches = not self._left_stop < self.x < self._right_stop
         if touches and not self._touches and self.on_contact is not None:
             self.on_contact(speed)
         self._touches = touches
 
     def _press_switches(self) -> None:
         """Press the switches that the rig has, at the ends of the track."""
-        x, half = self._data.qpos[0], self._settings.track_half_length
-        left = -x >= half - HYSTERESIS * (self.switches & 1)
-        right = x >= half - HYSTERESIS * (self.switches >> 1)
-        self.switches = self._rig.switches & (left + 2 * right)
+        if self._rig.switches:
+            x, half = self.x, self._settings.track_half_length
+            left = -x >= half - HYSTERESIS * (self.switches & 1)
+            right = x >= half - HYSTERESIS * (self.switches >> 1)
+            self.switches = self._rig.switches & (left + 2 * right)
 
     def _cogging(self, x: float) -> float:
         """Return the cogging force, which pulls the cart to the nearest stable position, N."""
