@@ -528,6 +528,8 @@ def _no_override(word: str, words: Sequence[str]) -> str:
 def _unknown_setting(setting: str, command: str, words: Sequence[str]) -> str:
     """Return the message for a setting that the composed config lacks."""
     group, groups = setting.partition(".")[0], default_choices(command)
+    if setting.startswith("layout.keep."):  # takes the name of any column
+        return f"{setting}: a new column needs a plus: '+{setting}=[low,high]'"
     if group not in groups and (conf_folder() / group).is_dir():
         return f"{setting}: cartpole-{command.replace('_', '-')} does not read this group"
     if group in groups and group not in WHOLE:

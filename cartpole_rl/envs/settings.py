@@ -110,7 +110,8 @@ Randomization = Annotated[
     Annotated[dict[str, Range], Tag("ranges")] | Annotated[IdentifiedSettings, Tag("identified")],
     Discriminator(_randomization_kind),
 ]
-ControlPeriod = Annotated[float, Field(ge=0.005, le=0.1)]  # s
+SHORTEST_PERIOD, LONGEST_PERIOD = 0.005, 0.1  # s
+ControlPeriod = Annotated[float, Field(ge=SHORTEST_PERIOD, le=LONGEST_PERIOD)]
 
 
 class FrictionSettings(Settings):

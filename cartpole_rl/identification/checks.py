@@ -20,7 +20,7 @@ from cartpole_rl.identification.prediction import (
     stretches,
 )
 from cartpole_rl.identification.rollout import Dynamics
-from cartpole_rl.identification.sensors import Motion, question_sensors
+from cartpole_rl.identification.sensors import Motion, falls_upwards, question_sensors
 from cartpole_rl.identification.windows import regular_frames
 from cartpole_rl.rig.hardware import Hardware
 from cartpole_rl.tasks.episode import Episode, wrap
@@ -87,6 +87,10 @@ def check_recordings(
     if seconds < SHORTEST:
         raise RecordingError(f"{seconds:.1f} s of recordings are too short; record {SHORTEST:g} s or more")
     _check_motion(episodes, LEAST_TRAVEL, LEAST_SWING)
+    if falls_upwards(motions(episodes), period):
+        raise RecordingError(
+            "the pole falls upwards in the recordings: the angle is half a turn off; 0 is upright"
+        )
     rests = any(_hangs_still(each, period) or stays_up(each, period) for each in episodes)
     if not rests and not zero_is_known(episodes, period, on_step):
         raise RecordingError(
@@ -109,9 +113,13 @@ def check_same_encoders(recordings: Mapping[str, Episode], hardware: Hardware) -
 
 def zero_is_known(episodes: Sequence[Episode], period: float, on_step: Callable[[], object]) -> bool:
     """Return True if motion tells the zero of the angle."""
-    motions = [Motion(each.x, each.theta, each.motor.astype(float)) for each in episodes]
-    zero = question_sensors(motions, period, on_step=on_step).angle_zero
+    zero = question_sensors(motions(episodes), period, on_step=on_step).angle_zero
     return zero is not None and zero.high - zero.low < ZERO_INTERVAL
+
+
+def motions(episodes: Sequence[Episode]) -> list[Motion]:
+    """Return the motion in each episode."""
+    return [Motion(each.x, each.theta, each.motor.astype(float)) for each in episodes]
 
 
 def shows_motion(episode: Episode) -> bool:

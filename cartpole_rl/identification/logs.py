@@ -2,7 +2,8 @@
 
 A layout says which columns a log has, their units and signs, which angle is upright, and whether the motor
 value of a row was chosen on that row's state or was in force before it. A log is split where rows are missing
-or left out, so that each part has a constant period.
+or left out, so that each part has a constant period. Rows with an empty cell, or with a number that is not
+finite, are left out.
 """
 
 import csv
@@ -28,6 +29,8 @@ SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 TURN = {"rad": 2 * np.pi, "deg": 360.0, "turn": 1.0}
 MOST_COUNTS = 2**31 - 1  # of an encoder, as in recordings
+LONGEST_GAP = 3  # gaps between two rows: rows further apart are missing, also where rows are resampled
+UNKNOWN, TWICE = "with an empty cell or no finite number", "that repeat the row before"
 SHORT, STANDING = "in a part that is too short", "in a part in which motor, cart or pole stand still"
 
 
@@ -44,6 +47,23 @@ class Report(NamedTuple):
     jitter: float  # s, 95 % of the gaps are within this of the period
 
 
+class Rows(NamedTuple):
+    """The rows of a file."""
+
+    path: Path
+    columns: dict[str, Array]  # [T] by name
+    time: Array  # [T] s, from 0
+    unknown: int  # further rows, with an empty cell or a number that is not finite
+    repeated: int  # further rows, the same as the one before
+
+    @property
+    def period(self) -> float:
+        """The mean gap between rows, s, of gaps that are near the median; to four digits."""
+        gaps = np.diff(self.time)
+        median = float(np.median(gaps))
+        return float(f"{gaps[np.abs(gaps - median) <= IRREGULAR * median].mean():.4g}")
+
+
 class Log(NamedTuple):
     """The episodes of one log, the parts of which have a constant period."""
 
@@ -52,27 +72,53 @@ class Log(NamedTuple):
 
 
 def read_log(path: Path, layout: Layout, encoders: Encoders) -> Log:
-    """Return the episodes in a log, in counts of `encoders`.
+    """Return the episodes in a log, in counts of `encoders`; see `read_rows` and `cut_log`."""
+    rows = read_rows(path, layout)
+    return cut_log(rows, layout, encoders, layout.period or rows.period)
 
-    A log is text, or holds arrays by name: .npz, .mat or .parquet. Raises RecordingError, with file and row.
+
+def read_rows(path: Path, layout: Layout) -> Rows:
+    """Return the rows of a log: text, or arrays by name in a .npz, .mat or .parquet file.
+
+    Raises RecordingError, with file and row.
     """
     columns = read_columns(path, layout)
+    known = np.logical_and.reduce([np.isfinite(values) for values in columns.values()])
+    if layout.time.since == "previous_row" and known.any():
+        gaps = columns[layout.time.name]
+        gaps = np.where(np.isfinite(gaps), gaps, 10 * np.nanmedian(gaps))  # rows are missing where unknown
+        columns[layout.time.name] = np.cumsum(gaps)
+    columns = {name: values[known] for name, values in columns.items()}
+    fresh = np.ones(known.sum(), bool)
+    fresh[1:] = ~np.logical_and.reduce([values[1:] == values[:-1] for values in columns.values()])
+    columns = {name: values[fresh] for name, values in columns.items()}
+    if fresh.sum() < 2:
+        raise RecordingError(f"{path} has fewer than two rows with a number in each of {', '.join(columns)}")
     time = times(path, columns[layout.time.name], layout.time)
+    return Rows(path, columns, time, int((~known).sum()), int((~fresh).sum()))
+
+
+def cut_log(read: Rows, layout: Layout, encoders: Encoders, period: float) -> Log:
+    """Return the episodes of a log with the control period `period`, s, in counts of `encoders`.
+
+    Raises RecordingError, with file and row.
+    """
+    path, columns, time = read.path, read.columns, read.time
     gaps = np.diff(time)
-    period = layout.period or float(np.median(gaps))
     jitter = float(np.quantile(np.abs(gaps - period), 0.95)) if len(gaps) else 0.0
     x = signed(layout.position.positive) * (columns[layout.position.name] - layout.position.zero)
     x *= METRES[layout.position.unit] if isinstance(layout.position.unit, str) else layout.position.unit
     turn = TURN[layout.angle.unit] if isinstance(layout.angle.unit, str) else layout.angle.unit
     theta = signed(layout.angle.positive) * (columns[layout.angle.name] - layout.angle.upright) / turn
     motor = signed(layout.motor.positive) * columns[layout.motor.name] / layout.motor.full
-    counted, left_out = np.ones(len(time), bool), {}
+    counted, left_out = np.ones(len(time), bool), {UNKNOWN: read.unknown, TWICE: read.repeated}
     for name, (low, high) in layout.keep.items():
         bad = (columns[name] < low) | (columns[name] > high)
         left_out[f"{name} not in {low:g} to {high:g}"] = int((bad & counted).sum())
         counted &= ~bad
-    regular = np.ones(len(gaps), bool)
-    if not layout.resample:
+    if layout.resample:
+        regular = gaps <= LONGEST_GAP * np.median(gaps)
+    else:
         regular = np.abs(gaps - period) <= IRREGULAR * period
     together = counted[:-1] & counted[1:] & regular
     edges = np.flatnonzero(np.diff(np.concatenate(([False], together, [False]))))
@@ -107,7 +153,7 @@ def read_log(path: Path, layout: Layout, encoders: Encoders) -> Log:
     alone = ~np.concatenate(([False], together)) & ~np.concatenate((together, [False])) & counted
     left_out["alone between gaps"] = int(alone.sum())
     report = Report(
-        len(time),
+        len(time) + read.unknown + read.repeated,
         {reason: number for reason, number in left_out.items() if number},
         int((~regular).sum()),
         int((np.abs(motor) >= 0.999).sum()),
@@ -203,10 +249,6 @@ def array_columns(
         if column.ndim != 1 or column.dtype.kind not in "fiub":
             raise RecordingError(f"{path}: {name} is no column of numbers")
         columns[name] = column.astype(float)
-        if (wrong := np.flatnonzero(~np.isfinite(columns[name]))).size:
-            raise RecordingError(
-                f"{path}, row {wrong[0] + 1}: {name} is {columns[name][wrong[0]]}; give a finite number"
-            )
     sizes = {name: len(column) for name, column in columns.items()}
     if len(set(sizes.values())) > 1 or min(sizes.values()) < 2:
         listed = ", ".join(f"{name} {size}" for name, size in sizes.items())
@@ -228,26 +270,23 @@ def _numbers(
     for index, (row, line) in enumerate(zip(rows, lines, strict=True)):
         cell = row[column].strip() if column < len(row) else ""
         try:
-            values[index] = float(cell.replace(layout.decimal, "."))
+            values[index] = float(cell.replace(layout.decimal, ".") or "nan")
         except ValueError:
-            found = f"is {cell!r}" if cell else "is empty"
             raise RecordingError(
-                f"{path}, line {line}: {name} {found}; give a number, or mend decimal= and delimiter= of the "
-                "layout"
+                f"{path}, line {line}: {name} is {cell!r}; give a number, or mend decimal= and delimiter= of "
+                "the layout"
             ) from None
-        if not np.isfinite(values[index]):
-            raise RecordingError(f"{path}, line {line}: {name} is {cell}; give a finite number")
     return values
 
 
 def times(path: Path, values: Array, column: TimeColumn) -> Array:
-    """Return the time of each row in s, from 0."""
-    seconds = values * SECONDS[column.unit]
-    time = np.cumsum(seconds) - seconds[0] if column.since == "previous_row" else seconds - seconds[0]
+    """Return the time of each row in s, from 0, for values that count from a start. Raises RecordingError."""
+    time = (values - values[0]) * SECONDS[column.unit]
     if (back := np.flatnonzero(np.diff(time) <= 0)).size:
+        before, after = time[back[0] : back[0] + 2]
         raise RecordingError(
-            f"{path}: the time {column.name} does not increase after row {back[0] + 1}; sort the rows, or "
-            "give another column"
+            f"{path}: the time {column.name} goes from {before:.6g} to {after:.6g} s after row "
+            f"{back[0] + 1}; sort the rows, give another column, or cut the log where the clock began anew"
         )
     return time
 

@@ -8,29 +8,34 @@ by equation (3.6) divided by the pivot inertia; l is the length of the equivalen
 angle is scale * (recorded - zero). A wrong scale or zero bends the sine, and a wrong scale of the position
 changes the ratio of the two terms, so all three follow from motion.
 
-Derivatives are those of cubics through seven or more samples (Savitzky and Golay, Anal. Chem. 36, 1964).
+Accelerations are those of cubics through seven or more samples (Savitzky and Golay, Anal. Chem. 36, 1964),
+which is a weighted mean of second differences. Every other term is averaged by the same weights: two filters
+that damp differently would bend the sine, as a wrong scale does.
 Intervals are 95 % by a bootstrap over recordings, or over pieces of one recording.
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
-from scipy.signal import savgol_filter
+from scipy.signal import savgol_coeffs
 
 from cartpole_rl.physics.parameters import GRAVITY
 
 Array = NDArray[np.float64]
 
-WINDOW = 0.14  # s through which a cubic is laid
+WINDOW = 0.144  # s through which a cubic is laid: 9 rows at 20 ms
 LEAST_ROWS = 7
 LEAST_SAMPLES = 200  # of motion, for an estimate
 SAMPLES = 20  # of the bootstrap
 PIECE = 100  # rows of a recording that are drawn together
 SWINGING = 1.0  # rad of the pole that tell its scale
-DELAYS = np.arange(-2.0, 4.01, 0.25)  # periods
+NUMEROV = np.array((1, 10, 1)) / 12  # the mean of an acceleration over which a second difference extends
+EARLIEST, LATEST = 2, 4  # periods before and after its row in which a motor value may come into force
+LONGEST_DELAY = 0.06  # s; with a short period, more than LATEST
+FINEST = 1e-3  # s between two delays that are tried, or a quarter of a period
 SPEED = 0.05  # m/s from which friction opposes the motion of the cart
 SCALES = (1.0, np.pi / 180, 180 / np.pi)  # of the angle, from which a fit starts
 WIDEST = 0.2, 0.1, 0.5  # interval of an estimate: scale of the angle, its zero in rad, scale of the position
@@ -64,8 +69,15 @@ class Sensors(NamedTuple):
     angle_zero: Estimate | None  # rad, recorded angle of the upright pole
     position_scale: Estimate | None  # true over recorded position
     delay: Estimate | None  # s from a row's state until its motor value moves the cart
+    falls_upwards: bool  # gravity pulls the pole towards the recorded upright: the angle is half a turn off
     push: float  # correlation of motor values and the cart's acceleration: negative means a wrong sign
     lag: float  # of the cart's acceleration and the pole's: negative means a wrong sign
+
+
+def falls_upwards(motions: Sequence[Motion], period: float) -> bool:
+    """Return True if gravity pulls the pole towards its recorded upright; False if motion does not tell."""
+    samples = samples_of(motions, period)
+    return samples is not None and samples.falls_upwards
 
 
 class Samples:
@@ -80,30 +92,60 @@ class Samples:
             kept.append((inside >= edge) & (inside < length - edge))
             pieces.append(piece + inside // PIECE)
             piece = int(pieces[-1][-1]) + 1
-        self._kept, self._period, self._rows = np.concatenate(kept), period, rows
+        self._kept, self._period = np.concatenate(kept), period
+        self._weights = np.cumsum(np.cumsum(savgol_coeffs(rows, 3, deriv=2)))[:-2]  # [rows - 2], sum 1
         self.piece = np.unique(np.concatenate(pieces)[self._kept], return_inverse=True)[1]
         self._theta = np.concatenate([motion.theta for motion in motions])
-        self.theta_dot, self.theta_ddot = self.smooth(self._theta, 1), self.smooth(self._theta, 2)
         x = np.concatenate([motion.x for motion in motions])
-        self.x, self.x_dot, self.x_ddot = self.smooth(x), self.smooth(x, 1), self.smooth(x, 2)
+        self._theta_dot, x_dot = np.gradient(self._theta, period), np.gradient(x, period)
+        self._x_ddot = self._second_difference(x)
+        self.theta_ddot, self.x_ddot = (
+            self.mean(self._second_difference(self._theta)),
+            self.mean(self._x_ddot),
+        )
+        # of the pole's place beside its pivot, in lengths
+        self.lean_ddot = self.mean(self._second_difference(np.sin(self._theta)))
+        self.x, self.x_dot = self.mean(x), self.mean(x_dot)
         self._motions = motions
 
-    def smooth(self, values: Array, derivative: int = 0) -> Array:
-        """Return a derivative [K] of values in all rows."""
-        filtered: Array = savgol_filter(values, self._rows, 3, deriv=derivative, delta=self._period)
-        return filtered[self._kept]
+    @property
+    def moves(self) -> bool:
+        """True if there is motion enough for an estimate."""
+        return len(self.piece) >= LEAST_SAMPLES and bool(self.x_ddot.std() > 0)
+
+    @property
+    def swings(self) -> bool:
+        """True if the pole swings enough to tell its scale."""
+        return max(float(np.ptp(motion.theta)) for motion in self._motions) > SWINGING
+
+    @property
+    def falls_upwards(self) -> bool:
+        """True if gravity pulls the pole towards its recorded upright, whatever the unit of the angle."""
+        if not (self.moves and self.swings):
+            return False
+        fits = []
+        for scale in SCALES:
+            solution, errors = _regression(self.pole_terms(scale), scale * self.theta_ddot, None)
+            fits.append((float(errors.std()) / scale, float(solution[0])))
+        return min(fits)[1] < 0
+
+    def _second_difference(self, values: Array) -> Array:
+        return np.convolve(values, (1, -2, 1), "same") / self._period**2
+
+    def mean(self, values: Array) -> Array:
+        """Return the weighted mean [K] of values in all rows."""
+        return np.convolve(values, self._weights, "same")[self._kept]
 
     def pole_terms(self, scale: float = 1.0, zero: float = 0.0) -> Array:
         """Return the terms [K, 3] of the pole's acceleration: gravity, the cart, friction."""
         theta = scale * (self._theta - zero)
-        return np.stack(
-            (self.smooth(np.sin(theta)), -self.x_ddot * self.smooth(np.cos(theta)), -scale * self.theta_dot),
-            1,
-        )
+        gravity, friction = (np.convolve(each, NUMEROV, "same") for each in (np.sin(theta), self._theta_dot))
+        terms = gravity, -self._x_ddot * np.cos(theta), -scale * friction
+        return np.stack([self.mean(each) for each in terms], 1)
 
     def push(self, periods: float) -> Array:
-        """Return the smoothed motor value [K], in force `periods` after its state."""
-        return self.smooth(np.concatenate([delayed(motion.motor, periods) for motion in self._motions]))
+        """Return the mean motor value [K], in force `periods` after its state."""
+        return self.mean(np.concatenate([delayed(motion.motor, periods) for motion in self._motions]))
 
 
 def question_sensors(
@@ -113,34 +155,48 @@ def question_sensors(
 
     `on_step` is called for each sample of the bootstrap.
     """
-    rows = max(LEAST_ROWS, 2 * round(WINDOW / period / 2) + 1)
-    kept = [motion for motion in motions if len(motion.motor) > rows + 2]
-    if not kept:
-        return Sensors(None, None, None, None, 0.0, 0.0)
-    samples = Samples(kept, period, rows)
-    pushes = [samples.push(each) for each in DELAYS]
+    samples = samples_of(motions, period)
+    if samples is None:
+        return Sensors(None, None, None, None, False, 0.0, 0.0)
+    delays = np.arange(-EARLIEST, max(LATEST, LONGEST_DELAY / period) + 0.01, max(0.25, FINEST / period))
+    pushes = [samples.push(each) for each in delays]
     dice = np.random.default_rng(seed)
-    swings = max(float(np.ptp(motion.theta)) for motion in kept) > SWINGING
-    moves = len(samples.piece) >= LEAST_SAMPLES and samples.x_ddot.std() > 0
+    upwards = samples.falls_upwards
     scale = zero = position = delay = None
-    if moves and swings:
+    if samples.moves and samples.swings:
         found = angle_estimates(samples, dice, on_step)
         known = (each.high - each.low < widest for each, widest in zip(found, WIDEST, strict=True))
         scale, zero, position = (each if sure else None for each, sure in zip(found, known, strict=True))
-    if moves and pushes[0].std() > 0:
-        delay = delay_estimate(samples, pushes, period, dice, on_step)
+        zero = None if upwards else zero
+    if samples.moves and pushes[0].std() > 0:
+        delay = delay_estimate(samples, pushes, period * delays, dice, on_step)
     correlations = [_correlation(push, samples.x_ddot) for push in pushes]
-    return Sensors(scale, zero, position, delay, max(correlations, key=abs), _lag(samples))
+    lag = -_lag(samples) if upwards else _lag(samples)
+    return Sensors(scale, zero, position, delay, upwards, max(correlations, key=abs), lag)
+
+
+def samples_of(motions: Sequence[Motion], period: float) -> Samples | None:
+    """Return the samples of recordings with the control period `period`, s; None if they are too short."""
+    rows = max(LEAST_ROWS, 2 * round(WINDOW / period / 2) + 1)
+    kept = [motion for motion in motions if len(motion.motor) > rows + 2]
+    return Samples(kept, period, rows) if kept else None
 
 
 def delayed(motor: Array, periods: float) -> Array:
     """Return the mean motor value [T + 1] around each row, each in force `periods` after its state.
 
-    Around row t, half of the time belongs to the period before it and half to the one after.
+    The mean is the second difference of the value's double integral, as accelerations are those of positions.
     """
-    steps = np.arange(len(motor) + 1, dtype=float)
-    edges = np.concatenate((np.zeros(1), np.cumsum(motor)))  # integral of the value in force
-    return np.interp(steps + 0.5 - periods, steps, edges) - np.interp(steps - 0.5 - periods, steps, edges)
+    once = np.concatenate((np.zeros(1), np.cumsum(motor)))  # integral of the value in force, at each row
+    twice = np.concatenate((np.zeros(1), np.cumsum(once[:-1] + motor / 2)))
+
+    def integral(rows: Array) -> Any:
+        row = np.clip(np.floor(rows).astype(int), 0, len(motor) - 1)
+        part = rows - row
+        return twice[row] + once[row] * part + motor[row] * part**2 / 2
+
+    at = np.arange(len(motor) + 1, dtype=np.float64) - periods
+    return np.asarray(integral(at + 1) - 2 * integral(at) + integral(at - 1), np.float64)
 
 
 def angle_estimates(
@@ -177,20 +233,26 @@ def angle_estimates(
 def delay_estimate(
     samples: Samples,
     pushes: Sequence[Array],
-    period: float,
+    delays: Array,
     dice: np.random.Generator,
     on_step: Callable[[], object],
-) -> Estimate:
-    """Return the time from a state to the effect of its motor value on the cart, s."""
+) -> Estimate | None:
+    """Return the time from a state to the effect of its motor value on the cart, s; None beyond `delays`.
+
+    By equation (3.5), the centre of mass of cart and pole accelerates under motor and friction alone.
+    """
     direction = np.tanh(samples.x_dot / SPEED)
 
     def best(weights: Array | None) -> float:
         on_step()
-        terms = (np.stack((push, samples.x_dot, direction, samples.x), 1) for push in pushes)
+        terms = (
+            np.stack((push, samples.x_dot, direction, samples.x, samples.lean_ddot), 1) for push in pushes
+        )
         sizes = [np.mean(_regression(each, samples.x_ddot, weights)[1] ** 2) for each in terms]
-        return period * _lowest(DELAYS, np.array(sizes))
+        return _lowest(delays, np.array(sizes))
 
-    return _estimate(best(None), [best(_weights(samples.piece, dice)) for _ in range(SAMPLES)])
+    found = _estimate(best(None), [best(_weights(samples.piece, dice)) for _ in range(SAMPLES)])
+    return found if delays[0] < found.value < delays[-1] else None
 
 
 def _regression(terms: Array, values: Array, weights: Array | None) -> tuple[Array, Array]:

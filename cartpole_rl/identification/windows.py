@@ -170,8 +170,8 @@ def regular_frames(episode: Episode, period: float) -> NDArray[np.bool_]:
 
 
 def recorded_period(episode: Episode) -> float:
-    """Return the control period of a recording, s: the median time between frames, to 0.1 ms."""
-    return round(float(np.median(np.diff(episode.time))), 4)
+    """Return the control period of a recording, s: the median time between frames, to 0.01 ms."""
+    return round(float(np.median(np.diff(episode.time))), 5)
 
 
 def split(episodes: Sequence[Episode]) -> tuple[list[Episode], list[Episode]]:

@@ -17,7 +17,7 @@ from tqdm import tqdm
 from cartpole_rl.checking import validated
 from cartpole_rl.choices import choice, is_shipped
 from cartpole_rl.emulator.settings import EmulatorSettings
-from cartpole_rl.errors import ConfigError, RecordingError
+from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.recordings import read_recording, write_recording
 from cartpole_rl.files import replacing, write_text
 from cartpole_rl.identification.checks import check_recordings, check_same_encoders
@@ -26,6 +26,7 @@ from cartpole_rl.identification.identify import Identification, identify
 from cartpole_rl.identification.one_step import one_step_estimates
 from cartpole_rl.identification.quantities import intervals, no_force_up_to
 from cartpole_rl.identification.unknowns import WEIGHED
+from cartpole_rl.identification.windows import part
 from cartpole_rl.physics.laws import Law
 from cartpole_rl.physics.models import REGISTRIES, Models
 from cartpole_rl.physics.parameters import CartParameters
@@ -98,9 +99,10 @@ def identify_cart(config: IdentifyConfig, folder: Path) -> None:
     check_same_encoders({str(files[name]): episode for name, episode in recorded.items()}, config.hardware)
     if config.source is not None:
         warn_of_another_pole(config.pole.nominal, files.values())
-    fitted, held_out = split(recorded, source)
+    fitted, held_out = split(recorded)
     by_file, held_out_by_file = (
-        {str(files[name]): episode for name, episode in chosen.items()} for chosen in (fitted, held_out)
+        {str(files.get(name, name)): episode for name, episode in chosen.items()}
+        for chosen in (fitted, held_out)
     )
     with progress_bar(None, "steps", desc="checking", leave=False) as bar:
         check_recordings(by_file, held_out_by_file, config.control_period, bar.update)
@@ -179,16 +181,20 @@ def make_plant(config: IdentifyConfig) -> SerialPlant:
     return plant
 
 
-def split(recordings: Episodes, source: Path) -> tuple[Episodes, Episodes]:
+def split(recordings: Episodes) -> tuple[Episodes, Episodes]:
     """Return the recordings to fit, and the held-out ones.
 
-    Held out are the experiment of that name, or else every fifth recording, or the last of fewer than five.
+    Held out are the experiment of that name, or else every fifth recording, or the last of fewer than five,
+    or the last fifth of a single one.
     """
     names = list(recordings)
+    if len(names) == 1:
+        (episode,) = recordings.values()
+        end = episode.steps - episode.steps // HELD_OUT_OF
+        rest = part(episode, end, episode.steps)
+        return {names[0]: part(episode, 0, end)}, {f"the last fifth of {names[0]}": rest}
     held_out = [HELD_OUT] if HELD_OUT in recordings else names[HELD_OUT_OF - 1 :: HELD_OUT_OF] or names[-1:]
     fitted = {name: episode for name, episode in recordings.items() if name not in held_out}
-    if not fitted:
-        raise RecordingError(f"from={source}: give two recordings or more; the last one is held out")
     return fitted, {name: recordings[name] for name in held_out}
 
 

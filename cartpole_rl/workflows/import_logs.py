@@ -6,18 +6,20 @@ position, and a motor value that was chosen a row earlier or later.
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from cartpole_rl.choices import choice
+from cartpole_rl.envs.settings import LONGEST_PERIOD, SHORTEST_PERIOD
 from cartpole_rl.errors import RecordingError
 from cartpole_rl.evaluation.exchange import read_mcap, read_minari
 from cartpole_rl.evaluation.recordings import LENGTH, write_recording
-from cartpole_rl.identification.logs import Log, Report, read_log
-from cartpole_rl.identification.sensors import Estimate, Motion, Sensors, question_sensors
+from cartpole_rl.identification.checks import motions
+from cartpole_rl.identification.logs import Log, Report, Rows, cut_log, read_rows
+from cartpole_rl.identification.sensors import Estimate, Sensors, question_sensors
 from cartpole_rl.identification.settings import ImportConfig, Layout, log_files
 from cartpole_rl.rig.hardware import nominal_hardware
 from cartpole_rl.run_folder import RECORDINGS, write_config, write_json
@@ -30,6 +32,9 @@ CORRELATED = 0.2  # size of a correlation that has a sign
 ANGLE_SCALE, POSITION_SCALE = 0.01, 0.10  # share by which a scale may differ
 ANGLE_ZERO = 0.02  # rad by which the upright angle may differ
 JITTER = 0.1  # share of the period
+SAME = 0.01  # share by which the periods of two logs may differ
+LATE = 0.05  # s, or two periods: a cart that takes longer is unusual
+RESAMPLED = 5e-4  # s between rows from which a log may be so fast
 LEAPS = 0.02  # share of rows
 SATURATED = 0.5  # share of rows
 TURN = 2 * np.pi
@@ -49,30 +54,24 @@ def import_logs(config: ImportConfig, folder: Path) -> Sensors | None:
         import_recordings(form, places, config, folder)
         return None
     paths = log_files(config)
-    logs = {}
+    rows = {}
     with progress_bar(len(paths), "logs") as bar:
         for path in paths:
-            logs[path] = read_log(path, config.layout, config.hardware.encoders)
+            rows[path] = read_rows(path, config.layout)
             bar.update()
-    periods = sorted({round(log.report.period, 4) for log in logs.values()})
-    if len(periods) > 1:
-        raise RecordingError(
-            f"from={config.source}: the logs have control periods from {1e3 * periods[0]:g} to "
-            f"{1e3 * periods[-1]:g} ms; import those of one period at a time, or give layout.period and "
-            "layout.resample=true"
-        )
+    period = config.layout.period or common_period(rows, config.source)
+    logs = {
+        path: cut_log(read, config.layout, config.hardware.encoders, period) for path, read in rows.items()
+    }
     parts = [part for log in logs.values() for part in log.parts]
+    reports = [log.report for log in logs.values()]
     if not parts:
-        reasons = sum((Counter(log.report.left_out) for log in logs.values()), Counter[str]())
-        raise RecordingError(
-            f"from={config.source}: no part of {config.layout.shortest:g} s is left; left out: "
-            + (", ".join(f"{number} rows {reason}" for reason, number in reasons.items()) or "none")
-        )
-    period = logs[paths[0]].report.period
-    motions = [Motion(part.x, part.theta, part.motor.astype(float)) for part in parts]
+        raise RecordingError(nothing_left(reports, period, config))
     with progress_bar(None, "steps", desc="sensors") as bar:
-        sensors = question_sensors(motions, period, on_step=bar.update)
-    found = [*doubts([log.report for log in logs.values()], sensors, period, config.layout)]
+        sensors = question_sensors(
+            motions(parts if period <= LONGEST_PERIOD else []), period, on_step=bar.update
+        )
+    found = [*doubts(reports, sensors, period, config.layout)]
     write_config(folder, "import", {**config.model_dump(mode="json", by_alias=True), "seed": 0})
     stems = Counter(path.stem for path in logs)
     heading = {"plant": "log", "pole": "", LENGTH: config.pole_length or "", "control_period_s": period}
@@ -84,6 +83,28 @@ def import_logs(config: ImportConfig, folder: Path) -> Sensors | None:
     write_json(folder / IMPORTED, summary(logs, sensors, found))
     print_summary(logs, parts, period, sensors, found, folder, config)
     return sensors
+
+
+def common_period(rows: Mapping[Path, Rows], source: Path) -> float:
+    """Return the control period of all logs, s. Raises RecordingError if they have several."""
+    periods = sorted(read.period for read in rows.values())
+    middle = periods[len(periods) // 2]
+    if periods[-1] - middle > SAME * middle or middle - periods[0] > SAME * middle:
+        raise RecordingError(
+            f"from={source}: the logs have control periods from {1e3 * periods[0]:g} to "
+            f"{1e3 * periods[-1]:g} ms; import those of one period at a time, or give layout.period and "
+            "layout.resample=true"
+        )
+    return middle
+
+
+def nothing_left(reports: Sequence[Report], period: float, config: ImportConfig) -> str:
+    """Return the message that no part of the logs is long enough, with what may be wrong."""
+    reasons = sum((Counter(each.left_out) for each in reports), Counter[str]())
+    message = f"from={config.source}: no part of {config.layout.shortest:g} s is left; left out: "
+    message += ", ".join(f"{number} rows {reason}" for reason, number in reasons.items()) or "none"
+    causes = [*_time_doubts(reports, period, config.layout)]
+    return "; ".join((message, *causes))
 
 
 def import_recordings(form: str, places: Sequence[Path], config: ImportConfig, folder: Path) -> None:
@@ -104,6 +125,11 @@ def import_recordings(form: str, places: Sequence[Path], config: ImportConfig, f
 
 def doubts(reports: Sequence[Report], sensors: Sensors, period: float, layout: Layout) -> Iterator[str]:
     """Yield a sentence for each thing that the motion or the rows contradict."""
+    if sensors.falls_upwards:
+        yield (
+            "the pole falls upwards: layout.angle.upright is half a turn off; give the recorded angle of the "
+            "upright pole"
+        )
     if sensors.push < -CORRELATED:
         yield (
             "positive motor values accelerate the cart to the left: give the other side for "
@@ -124,18 +150,29 @@ def doubts(reports: Sequence[Report], sensors: Sensors, period: float, layout: L
     if signs_fit:
         yield from _scale_doubts(sensors, layout)
         yield from _delay_doubts(sensors, period, layout)
-    jitter = max(report.jitter for report in reports)
-    if jitter > JITTER * period and not layout.resample:
-        yield (
-            f"the time between rows varies: 5 % are over {1e3 * jitter:.1f} ms from the period of "
-            f"{1e3 * period:g} ms; give the clock of the cart's board as layout.time, or layout.resample=true"
-        )
+    yield from _time_doubts(reports, period, layout)
     if beyond := sum(each.beyond for each in reports):
         full = f"layout.motor.full={layout.motor.full:g}"
         yield f"{beyond} of {rows} motor values are beyond {full}: give the largest"
     saturated = sum(each.saturated for each in reports)
     if saturated > SATURATED * rows:
         yield f"{saturated} of {rows} rows have full motor: the motor's curve cannot be told from them"
+
+
+def _time_doubts(reports: Sequence[Report], period: float, layout: Layout) -> Iterator[str]:
+    if not SHORTEST_PERIOD <= period <= LONGEST_PERIOD:
+        fast = RESAMPLED <= period < SHORTEST_PERIOD
+        resampled = ", or give layout.period=0.01 layout.resample=true" if fast else ""
+        yield (
+            f"rows are {1e3 * period:g} ms apart, and an identification takes {1e3 * SHORTEST_PERIOD:g} to "
+            f"{1e3 * LONGEST_PERIOD:g} ms: mend layout.time.unit{resampled}"
+        )
+    jitter = max(report.jitter for report in reports)
+    if jitter > JITTER * period and not layout.resample:
+        yield (
+            f"the time between rows varies: 5 % are over {1e3 * jitter:.1f} ms from the period of "
+            f"{1e3 * period:g} ms; give the clock of the cart's board as layout.time, or layout.resample=true"
+        )
 
 
 def _scale_doubts(sensors: Sensors, layout: Layout) -> Iterator[str]:
@@ -177,7 +214,7 @@ def _or_unit(factor: float) -> str:
 
 def _delay_doubts(sensors: Sensors, period: float, layout: Layout) -> Iterator[str]:
     delay = sensors.delay
-    if delay is None or (delay.high >= 0 and delay.low <= 2 * period):
+    if delay is None or (delay.high >= 0 and delay.low <= max(2 * period, LATE)):
         return
     early, chosen = delay.high < 0, layout.motor.row == "chosen"
     advice = {
@@ -186,7 +223,7 @@ def _delay_doubts(sensors: Sensors, period: float, layout: Layout) -> Iterator[s
         (True, False): f"is {layout.motor.name} what was sent to the motor, in the rows' order?",
         (False, True): "does it take the cart so long?",
     }
-    when = "too early" if early else "over two periods later"
+    when = "too early" if early else f"over {1e3 * max(2 * period, LATE):g} ms later"
     yield (
         f"the motor values seem shifted: they move the cart {when} ({1e3 * delay.value:.0f} ms, 95 %: "
         f"{1e3 * delay.low:.0f} to {1e3 * delay.high:.0f}, after the state of their row); "
@@ -243,8 +280,7 @@ def print_summary(
         print(f"doubt: {doubt}")
     cart = "" if config.hardware == nominal_hardware() else " cart=<yours>.yaml"
     rate = "" if math.isclose(period, choice("identify")["control_period"]) else f" control_period={period:g}"
-    print_results(
-        folder,
-        f"{RECORDINGS}/ and {IMPORTED}",
-        f"cartpole-identify from={shown(folder)}{cart} pole=<yours>.yaml{rate}",
-    )
+    following = f"cartpole-identify from={shown(folder)}{cart} pole=<yours>.yaml{rate}"
+    if not SHORTEST_PERIOD <= period <= LONGEST_PERIOD:
+        following = "cartpole-import, with the layout mended"
+    print_results(folder, f"{RECORDINGS}/ and {IMPORTED}", following)

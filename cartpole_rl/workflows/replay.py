@@ -4,6 +4,7 @@ The simulated cart is reset to the measured state every `restart` seconds: over 
 diverge.
 """
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -70,7 +71,9 @@ def replay_recordings(config: ReplayConfig, folder: Path) -> None:
     print(replay_table(errors, f"errors of {count}, pole={name}, over the time since a reset"))
     if away:
         print(replay_table(away, "the same away from upright; near it an error grows e times in 0.15 s"))
-    print_results(folder, f"{REPLAY} and {FIGURE}", f"cartpole-model {as_word('from', shown(config.source))}")
+    of_cart = [word for word in sys.argv[1:] if word.startswith(("cart=", "pole="))]
+    following = ["cartpole-model", as_word("from", shown(config.source)), *of_cart]
+    print_results(folder, f"{REPLAY} and {FIGURE}", " ".join(following))
     if config.view == "web":
         track = settings.task.x_max
         shown_episodes = [shown_beside(*pair, track) for pair in zip(paths, replays, strict=True)]

@@ -124,7 +124,7 @@ def by_toolbox(fit: Path, file: Path) -> Any:
     if not toolbox.INSTALLED:
         return None
     if not file.exists():
-        fitted, _ = split(recordings(fit), fit)
+        fitted, _ = split(recordings(fit))
         found = toolbox.fitted(cut_windows([*fitted.values()], PERIOD, most=WINDOWS), PERIOD)
         write_json(file, {"parameters": found, "at_bounds": toolbox.at_bounds(found)})
     return toolbox.MujocoCart.of(read_json(file)["parameters"], PERIOD)
@@ -176,7 +176,7 @@ def of_2020(logs: Path, home: Path) -> dict[str, Any]:
 
 def held_out_2020(run: Path, own: Path, step: Path) -> dict[str, Any]:
     """Return what is identified of a motor of 2020, and errors in mm and degrees at TIMES in its last log."""
-    _, held_out = split(recordings(run), run)
+    _, held_out = split(recordings(run))
     windows = stretches(held_out.values(), PERIOD_2020)
     carts = {
         CART: dynamics(nominal(), "step", "bearing", PERIOD_2020),

@@ -133,7 +133,7 @@ def test_an_agent_trains_on_what_was_found(run: Path, tmp_path: Path) -> None:
         ("train cart=nowhere/cart.yaml", "cart=nowhere/cart.yaml: there is no such file"),
         ("train randomization=./randomization.yaml", "posterior.npz cannot be read"),
         ("identify from=empty", "it contains no recording; give a run of cartpole-record or cartpole-id"),
-        ("identify from=single", "give two recordings or more"),
+        ("identify from=single", "the last fifth of swing: the motor value is 0 throughout"),
         (
             "identify from=recorded plant=serial plant.port=/dev/ttyUSB0",
             "plant: from=recorded reads recordings and drives no cart; leave one of them out",

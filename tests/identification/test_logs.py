@@ -17,6 +17,8 @@ from cartpole_rl.choices import choice, conf_folder
 from cartpole_rl.composition import compose
 from cartpole_rl.errors import ConfigError, RecordingError
 from cartpole_rl.evaluation.recordings import read_recording, write_recording
+from cartpole_rl.identification.checks import check_recordings
+from cartpole_rl.identification.experiments import recording
 from cartpole_rl.identification.logs import read_log
 from cartpole_rl.identification.sensors import Motion, question_sensors
 from cartpole_rl.identification.settings import ImportConfig, Layout
@@ -33,13 +35,23 @@ LAYOUT: dict[str, Any] = {
     "motor": {"name": "u", "full": 255},
 }
 Columns = dict[str, np.ndarray]
+ENCODERS = nominal_encoders()
 
 
 @pytest.fixture(scope="module")
 def motion() -> Columns:
+    return driven_pole(255)
+
+
+@pytest.fixture(scope="module")
+def swings() -> Columns:
+    return driven_pole(100)
+
+
+def driven_pole(most: int) -> Columns:
     """A swinging pole on a driven cart, by equation (3.6), at a fine step; the motor acts 10 ms late."""
     dice, fine = np.random.default_rng(3), 20
-    motor = np.repeat(dice.integers(-255, 256, STEPS // 6), 6).astype(float)
+    motor = np.repeat(dice.integers(-most, most + 1, STEPS // 6), 6).astype(float)
     step, late = PERIOD / fine, fine // 2
     x, x_dot, theta, theta_dot, rows = 0.0, 0.0, np.pi, 0.5, []
     for index in range(STEPS * fine):
@@ -131,13 +143,14 @@ def test_a_log_of_arrays_is_as_one_of_text(tmp_path: Path, motion: Columns, kind
     path = tmp_path / f"bad.{kind}"
     lacking = {name: motion[name] for name in "txu"}
     unknown = {**motion, "x": np.where(np.arange(STEPS) == 2, np.nan, motion["x"])}
-    for columns, message in (
-        (lacking, f"{path} has no column a; it has t, x, u"),
-        (unknown, f"{path}, row 3: x is nan; give a finite number"),
-    ):
-        ARRAYS[kind](path, columns)
-        with pytest.raises(RecordingError, match=re.escape(message)):
-            read_log(path, layout(), nominal_encoders())
+    ARRAYS[kind](path, unknown)
+    assert read_log(path, layout(), nominal_encoders()).report.left_out == {
+        "with an empty cell or no finite number": 1,
+        "in a part that is too short": 2,
+    }
+    ARRAYS[kind](path, lacking)
+    with pytest.raises(RecordingError, match=re.escape(f"{path} has no column a; it has t, x, u")):
+        read_log(path, layout(), nominal_encoders())
     path.write_bytes(b"neither")
     with pytest.raises(RecordingError, match="cannot be read: "):
         read_log(path, layout(), nominal_encoders())
@@ -188,6 +201,27 @@ def test_a_log_is_split_where_rows_are_missing_or_left_out(tmp_path: Path, motio
     assert log.report.left_out == {"bad not in 0 to 0": 2, "in a part that is too short": 49}
 
 
+@pytest.mark.parametrize("since", ["start", "previous_row"])
+def test_rows_without_a_number_and_repeated_ones_are_left_out(
+    tmp_path: Path, motion: Columns, since: str
+) -> None:
+    columns = {name: values.copy() for name, values in motion.items()}
+    columns["a"][400], columns["u"][900] = np.nan, np.inf
+    if since == "previous_row":
+        columns["t"] = np.diff(motion["t"], prepend=-PERIOD)
+        columns["t"][700] = np.nan
+    path = written(tmp_path / "log.csv", columns)
+    lines = path.read_text().replace("nan", "").splitlines()
+    if since == "start":
+        lines.insert(700, lines[700])
+    path.write_text("\n".join((*lines, "12.3,0.")))  # the power failed
+    log = read_log(path, layout(time={"since": since}), nominal_encoders())
+    assert [part.steps for part in log.parts] == [399, *([498] if since == "start" else [298, 198]), 598]
+    unknown = "with an empty cell or no finite number"
+    expected = {unknown: 4} if since == "previous_row" else {unknown: 3, "that repeat the row before": 1}
+    assert log.report.left_out == expected
+
+
 @pytest.mark.parametrize(("row", "shift"), [("chosen", 0), ("in_force", 1)])
 def test_a_part_knows_the_motor_values_before_it(
     tmp_path: Path, motion: Columns, row: str, shift: int
@@ -224,15 +258,31 @@ def test_a_log_with_a_varying_period_is_resampled(tmp_path: Path, motion: Column
     assert part.x == pytest.approx(np.interp(part.time + times[0], motion["t"], motion["x"]), abs=2e-3)
 
 
+def test_a_resampled_log_is_still_split_where_rows_are_missing(tmp_path: Path, motion: Columns) -> None:
+    columns = {name: np.delete(values, np.arange(400, 550)) for name, values in motion.items()}
+    log = read_log(
+        written(tmp_path / "log.csv", columns), layout(resample=True, period=0.05), nominal_encoders()
+    )
+    assert log.report.gaps == 1
+    assert [part.steps for part in log.parts] == [159, 379]
+
+
+def test_the_period_is_the_mean_gap(tmp_path: Path, motion: Columns) -> None:
+    """60 Hz with stamps in whole milliseconds: the median gap is 17 ms."""
+    columns = {**motion, "t": np.round(np.arange(STEPS) / 60, 3)}
+    log = read_log(written(tmp_path / "log.csv", columns), layout(), nominal_encoders())
+    assert log.report.period == 0.01667
+    assert len(log.parts) == 1
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("", "holds no rows"),
         ("t,x,a\n0,0,0\n1,1,1\n", r"has no column u; it has t, x, a"),
-        ("t,x,a,u\n0,0,0,0\n1,0,,0\n", "line 3: a is empty"),
+        ("t,x,a,u\n0,0,0,0\n1,0,,0\n2,0,nan,0\n", "fewer than two rows with a number in each of t, x, a, u"),
         ("t,x,a,u\n0,0,0,0\n1,0,two,0\n", "line 3: a is 'two'"),
-        ("t,x,a,u\n0,0,0,0\n1,0,nan,0\n", "line 3: a is nan; give a finite number"),
-        ("t,x,a,u\n0,0,0,0\n0,0,0,0\n", "the time t does not increase after row 1"),
+        ("t,x,a,u\n0,0,0,0\n9,0,0,0\n1,0,0,0\n", "the time t goes from 9 to 1 s after row 2; sort the rows"),
     ],
 )
 def test_a_bad_log_is_one_line(tmp_path: Path, text: str, message: str) -> None:
@@ -264,7 +314,34 @@ def test_sensors_are_known_from_motion(motion: Columns) -> None:
     assert sensors.position_scale is not None
     assert sensors.position_scale.value == pytest.approx(1 / 1.1, rel=0.03)
     assert sensors.delay is not None
-    assert sensors.delay.value == pytest.approx(0.01, abs=0.004)
+    assert sensors.delay.value == pytest.approx(0.01, abs=0.002)
+
+
+def test_the_intervals_of_a_swinging_pole_hold_the_truth(swings: Columns) -> None:
+    """The pole never goes over the top; the filters of both sides of the equation have to be the same."""
+    sensors = question_sensors([Motion(swings["x"], swings["a"], swings["u"][:-1])], PERIOD)
+    assert np.abs(swings["a"] - np.pi).max() < 3
+    for estimate, truth, margin in (
+        (sensors.angle_scale, 1, 2e-3),
+        (sensors.angle_zero, 0, 4e-3),
+        (sensors.position_scale, 1, 2e-3),
+        (sensors.delay, 0.0095, 1e-3),  # this integration lets a force act half a step early
+    ):
+        assert estimate is not None
+        assert estimate.holds(truth, margin), estimate
+        assert estimate.high - estimate.low < 5 * margin
+
+
+def test_a_pole_that_falls_upwards_is_refused(motion: Columns) -> None:
+    part = recording(
+        np.rint(np.stack((motion["x"] / ENCODERS.metres, (motion["a"] - np.pi) / ENCODERS.radians), 1)),
+        np.full(STEPS - 1, PERIOD),
+        motion["u"][:-1].astype(np.int64),
+        "time",
+        ENCODERS,
+    )
+    with pytest.raises(RecordingError, match="the pole falls upwards in the recordings"):
+        check_recordings({"a": part}, {"b": part}, PERIOD)
 
 
 BROKEN: dict[str, tuple[Callable[[Columns], Columns], list[str]]] = {
@@ -284,8 +361,15 @@ BROKEN: dict[str, tuple[Callable[[Columns], Columns], list[str]]] = {
     "scale of 4 %": (lambda each: {**each, "a": 1.04 * each["a"]}, [r"0\.96\d times as far"]),
     "zero": (lambda each: {**each, "a": each["a"] + 0.06}, ["upright at a recorded angle of 3"]),
     "millimetres": (lambda each: {**each, "x": 1e3 * each["x"]}, ["may be in mm"]),
+    "hanging at 0": (lambda each: {**each, "a": each["a"] - np.pi}, ["layout.angle.upright is half a turn"]),
+    "hanging at 0, angle sign": (
+        lambda each: {**each, "a": np.pi - each["a"]},
+        ["layout.angle.upright is half a turn", "the other side for layout.angle.positive"],
+    ),
+    "milliseconds": (lambda each: {**each, "t": 1e3 * each["t"]}, ["rows are 20000 ms apart.*time.unit$"]),
+    "2 ms": (lambda each: {**each, "t": each["t"] / 10}, ["rows are 2 ms apart.*layout.resample=true"]),
     "a row later": (lambda each: {**each, "u": np.roll(each["u"], 1)}, ["layout.motor.row=in_force"]),
-    "three rows earlier": (lambda each: {**each, "u": np.roll(each["u"], -3)}, ["over two periods later"]),
+    "three rows earlier": (lambda each: {**each, "u": np.roll(each["u"], -3)}, ["over 50 ms later"]),
 }
 
 
@@ -301,6 +385,8 @@ def test_each_fault_of_a_log_is_a_doubt(
     doubts = re.findall("doubt: (.*)", capsys.readouterr().out)
     for doubt in expected:
         assert any(re.search(doubt, each) for each in doubts), doubts
+    if "time" in expected[0] or "half a turn" in expected[0]:  # nothing else is wrong
+        assert len(doubts) == len(expected)
 
 
 def test_logs_of_several_periods_are_refused(tmp_path: Path, motion: Columns) -> None:
