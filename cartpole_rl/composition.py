@@ -61,6 +61,7 @@ from cartpole_rl.terminal import in_quotes
 WORD = re.compile(r"([a-z_]+)=(.+)", re.DOTALL)
 NAME = re.compile(r"(?!(?:null|true|false|nan|inf)$)[a-z_][\w-]*", re.IGNORECASE | re.ASCII)
 OWN = "own"  # the group of what a user's own choices give: own/cart, own/pole, ...
+KEPT = "emulator.given="
 FRICTIONS = ("cart_friction", "pole_friction")  # groups whose `parameters` replace numbers of `cart`
 ONE_OF = {  # settings of a group, or of each of its parameters, of which one is given
     "pole": ("choices", "lengths"),
@@ -223,8 +224,16 @@ class _OwnChoices:
             names = [f"{group}.parameters.{name}" for name in values["parameters"]]
             if f"{group}.parameters" not in keys:
                 more += [f"++{name}=null" for name in names if name not in keys]
+        if kept := self._kept_by_emulator(keys):
+            more.append(f"{KEPT}[{','.join(kept)}]")
         place = next((number for number, word in enumerate(words) if key_of(word)), 0)
         return [*words[:place], *more, *words[place:]]
+
+    def _kept_by_emulator(self, keys: Iterable[str]) -> list[str]:
+        """Return the settings of the emulator that the user gave, which no cart's file replaces."""
+        on_line = {key.split(".")[1] for key in keys if key.startswith("emulator.")}
+        in_files = _names(*self.given["emulator"].values()) if len(self.given["emulator"]) == 1 else set()
+        return sorted((on_line | in_files) - {"given"}) if self.groups.get("emulator") else []
 
     def remove(self) -> None:
         """Remove the choices from the ConfigStore."""
@@ -323,7 +332,9 @@ def task_overrides(given: list[str] | ListConfig) -> list[str]:
 
 def is_completing(word: str) -> bool:
     """Return True for an override that no user gave: one that completes others."""
-    return word.startswith(f"+{OWN}/") or bool(re.fullmatch(r"\+\+\w+_friction\.parameters\.\w+=null", word))
+    return word.startswith((f"+{OWN}/", KEPT)) or bool(
+        re.fullmatch(r"\+\+\w+_friction\.parameters\.\w+=null", word)
+    )
 
 
 def _nulls(numbers: Iterable[str], replaced: Mapping[str, set[str]]) -> dict[str, Any]:

@@ -21,6 +21,7 @@ from cartpole_rl.exporting.agent import read_agent
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.errors import fault_error
 from cartpole_rl.plants.settings import SerialSettings
+from cartpole_rl.rig.hardware import hardware_of
 from cartpole_rl.signals import RaiseOnce, ending_signals
 from cartpole_rl.wire import Flags, seconds_between
 
@@ -118,7 +119,12 @@ def main(file, port, pole_length="0"):
     if agent.start == "upright":
         raise ConfigError("this agent needs an upright pole, and here it hangs; give an agent that swings up")
     length = length_of(pole_length, agent)
-    with SerialCart(SerialSettings(port=port)) as cart:
+    encoders = {
+        "cart_nanometres_per_count": round(1e9 * agent.cart_metres_per_count),
+        "pole_counts_per_turn": agent.pole_counts_per_turn,
+    }
+    # a cart with end switches also needs its left_switch and right_switch here
+    with SerialCart(SerialSettings(port=port), hardware_of(encoders)) as cart:
         cart.home()
         cart.set_period(round(agent.control_period * 1e6))
         upright = drive(cart, agent, exported.layers, length, 10)

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 from cartpole_rl.emulator.c_firmware import CFirmware
 from cartpole_rl.emulator.firmware import BANNER, Firmware
+from cartpole_rl.emulator.guards import lever_um
 from cartpole_rl.emulator.physics import CartPhysics
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.rig.hardware import nominal_hardware
@@ -144,11 +145,10 @@ class CartDevice:
         """Return the firmware that the settings choose, just booted."""
         cart, rig = self._settings, self._hardware
         zero_error = round(cart.angle_offset / self._encoders.radians)
-        felt = cart.backdrivability * cart.pole_mass
-        lever_um = round(1e6 * felt * cart.pole_com / (cart.cart_mass + felt))
+        lever = lever_um(cart.model_dump())
         if cart.firmware == "c":
-            return CFirmware(self._latency_us, zero_error, lever_um, cart.policy, 2 * cart.pole_com, rig)
-        return Firmware(self._latency_us, zero_error, lever_um, rig)
+            return CFirmware(self._latency_us, zero_error, lever, cart.policy, 2 * cart.pole_com, rig)
+        return Firmware(self._latency_us, zero_error, lever, rig)
 
     def _counts(self) -> tuple[int, int]:
         """Return the raw counts of cart and pole since boot."""

@@ -28,6 +28,7 @@ Periods are in microseconds.
 
 import math
 from collections import deque
+from collections.abc import Mapping
 
 from cartpole_rl.rig.hardware import Hardware
 
@@ -160,6 +161,12 @@ PUSHED = 5_000_000  # um/s^2: a hard push speeds a common cart up so hard
 SLOWED_US = 100_000  # time constant of the estimated speed without a hard push
 LOST_NM = 20_000_000  # estimated motion without a change of the count
 FASTEST_LOST = 2_500_000  # um/s; a higher estimate comes from a count that jumped
+
+
+def lever_um(numbers: Mapping[str, float]) -> int:
+    """Return the lever of `TrackLimits`, um, by the parameters of a cart and its pole."""
+    felt = numbers["backdrivability"] * numbers["pole_mass"]  # a stepper's cart does not swing with its pole
+    return round(1e6 * felt * numbers["pole_com"] / (numbers["cart_mass"] + felt))
 
 
 class TrackLimits:

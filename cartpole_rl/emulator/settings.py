@@ -37,6 +37,7 @@ class EmulatorSettings(Settings):
     policy: Path | None = None
     port: Port = "auto"  # a pseudo-terminal or a local TCP port; auto: pty where the system has it
     hardware: Hardware | None = None  # of the cart's file, which the firmware is built with; None: ip02's
+    given: tuple[str, ...] = ()  # settings that cart= does not replace: those that the user gave
     seed: Annotated[int, Field(ge=0)] = (
         0  # of latencies, disturbed frames, boot position and the hand's angle
     )
@@ -111,9 +112,9 @@ class EmulatorSettings(Settings):
     def of_cart(self, cart: Mapping[str, float]) -> Self:
         """Return the settings of a cart with the hardware, masses, friction and force of a file's numbers.
 
-        Where these settings are still those of the default cart, they become those of one that differs from
-        the file as the default cart differs from ip02's. A file with ip02's hardware changes nothing. Raises
-        ConfigError for another rig than `hardware`.
+        Where these settings are still those of the default cart, and not `given`, they become those of one
+        that differs from the file as the default cart differs from ip02's. A file with ip02's hardware
+        changes nothing. Raises ConfigError for another rig than `hardware`.
         """
         hardware, of_ip02 = hardware_of(cart), choice("cart/ip02")
         if self.hardware == hardware or (self.hardware is None and hardware == nominal_hardware()):
@@ -149,9 +150,11 @@ class EmulatorSettings(Settings):
             "deadband_right": min(start * default.deadband_right, LARGEST_MOTOR),
         }
         changes = {
-            name: value for name, value in scaled.items() if getattr(self, name) == getattr(default, name)
+            name: value
+            for name, value in scaled.items()
+            if name not in self.given and getattr(self, name) == getattr(default, name)
         }
-        return self.model_copy(update={**changes, "hardware": hardware})
+        return type(self).model_validate({**self.model_dump(), **changes, "hardware": hardware})
 
 
 def zero_force_motor(cart: Mapping[str, float]) -> float:

@@ -13,6 +13,7 @@ from typing import Self
 
 from pydantic import BaseModel
 
+from cartpole_rl.emulator.guards import LEVER
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import CartPoleError, ConfigError, EmulatorError, LinkError
 from cartpole_rl.plants.settings import LONGEST_WRITE, BoardSettings, SerialSettings
@@ -165,9 +166,14 @@ class BridgeProcess(CartProcess):
 
     what = "the bridge to the cart"
 
-    def __init__(self, board: BoardSettings, hardware: Hardware, control_period: float | None) -> None:
-        """`control_period` in s is refused if the board does not measure so; None takes the board's own."""
-        given = {"plant": board, "hardware": hardware, "control_period": control_period}
+    def __init__(
+        self, board: BoardSettings, hardware: Hardware, control_period: float | None, lever: int = LEVER
+    ) -> None:
+        """`control_period` in s is refused if the board does not measure so; None takes the board's own.
+
+        `lever` is that of `TrackLimits`, um.
+        """
+        given = {"plant": board, "hardware": hardware, "control_period": control_period, "lever_um": lever}
         super().__init__("cartpole_rl.plants.drivers", json.dumps(given, default=BaseModel.model_dump))
 
     def _why(self, code: int) -> str:

@@ -220,7 +220,7 @@ class RealCartSettings(PlantSettings):
     write_timeout: Annotated[float, Field(gt=0, le=LONGEST_WRITE)] = 0.2
     # Silence after which the host sends HELLO. It is longer than any period: a HELLO delays the next state.
     nudge_after: Annotated[float, Field(ge=0.2, le=60)] = 0.5
-    home_timeout: Wait = 120.0  # for homing
+    home_timeout: Wait = 120.0  # for homing; about 20 s for each metre of track, and a minute
     start_timeout: Wait = 60.0  # for the pole to reach the position in which an episode starts
 
     @field_validator("port", mode="before")
@@ -300,6 +300,8 @@ class BoardSettings(RealCartSettings):
             raise ValueError(f"{name} is for sends=speed and sends=acceleration; leave it out")
         if self.pole_range is not None and not self.pole_range[0] < self.pole_range[1]:
             raise ValueError(f"pole_range={list(self.pole_range)}: give the smaller count first")
+        if self.homing != "board" and self.home_position:
+            raise ValueError(f"home_position is for homing=board, not homing={self.homing}; leave it out")
         if self.homing == "stops" and self.sends != "value":
             raise ValueError(
                 f"homing=stops with sends={self.sends}: a stepper loses steps at a stop; give hand or board"
@@ -398,6 +400,14 @@ class TextSettings(BoardSettings):
     def _board_homes_by_a_line(self) -> Self:
         if self.homing == "board" and self.home_line is None:
             raise ValueError("homing=board needs home_line, the line that starts the board's own homing")
+        if self.homing != "board" and self.home_line is not None:
+            raise ValueError("home_line is for homing=board: give homing=board, or leave it out")
+        return self
+
+    @model_validator(mode="after")
+    def _a_time_has_a_column(self) -> Self:
+        if "time" not in self.columns and "time_unit" in self.model_fields_set and self.time_unit != "us":
+            raise ValueError("time_unit is of the column time, which columns does not name; leave it out")
         return self
 
     @property

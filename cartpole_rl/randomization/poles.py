@@ -76,6 +76,14 @@ class PoleSettings(Settings):
         return Pole.rod(sum(self.lengths) / 2)
 
     @property
+    def heaviest(self) -> Pole:
+        """The pole that shakes its cart most: of the choices, or the longest rod."""
+        if self.choices is not None:
+            return max(self.choices.values(), key=lambda pole: pole.pole_mass * pole.pole_com)
+        assert self.lengths is not None
+        return Pole.rod(self.lengths[1])
+
+    @property
     def is_single(self) -> bool:
         """True if every cart carries the same pole."""
         return self.choices is not None and len(self.choices) == 1

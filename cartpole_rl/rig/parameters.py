@@ -10,11 +10,14 @@ A row of a simulated cart belongs to the entry of the same place, also in checkp
 
 import math
 from collections.abc import Iterable, Mapping
-from typing import NamedTuple
+from typing import NamedTuple, Self
+
+from pydantic import model_validator
 
 from cartpole_rl.checking import most_similar
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.rig.hardware import LARGEST_MOTOR
+from cartpole_rl.rig.hardware import HARDWARE, LARGEST_MOTOR, Hardware, hardware_of, parameters_of
+from cartpole_rl.settings import Finite, Settings
 
 
 class Bound(NamedTuple):
@@ -177,3 +180,32 @@ def check_values(values: Mapping[str, float]) -> None:
         if name not in values:
             raise ConfigError(f"the cart parameter {name!r} is missing")
         check_value(name, values[name])
+
+
+def check_cart(cart: Mapping[str, float]) -> None:
+    """Raise ConfigError for an unknown name in a cart's file, or an impossible number."""
+    hardware_of(cart)
+    for name, value in parameters_of(cart).items():
+        if name not in PARAMETERS:
+            nearest = most_similar(name, [*PARAMETERS, *HARDWARE])
+            raise ConfigError(f"cart.{name}: there is no such setting; did you mean cart.{nearest}?")
+        check_value(name, value)
+
+
+class RigSettings(Settings):
+    """A cart's file: parameters of its motion, and its hardware."""
+
+    cart: dict[str, Finite]
+
+    @model_validator(mode="after")
+    def _the_cart_is_possible(self) -> Self:
+        try:
+            check_cart(self.cart)
+        except ConfigError as error:
+            raise ValueError(str(error)) from None
+        return self
+
+    @property
+    def hardware(self) -> Hardware:
+        """The encoders, track and motor of the cart."""
+        return hardware_of(self.cart)

@@ -19,7 +19,6 @@ from cartpole_rl.envs.settings import (
     ObservationSettings,
     PoleFrictionSettings,
     Randomization,
-    RigSettings,
 )
 from cartpole_rl.errors import CheckpointError, ConfigError
 from cartpole_rl.identification.settings import EnsembleSettings
@@ -46,8 +45,7 @@ from cartpole_rl.randomization.poles import PoleSettings, check_one_pole
 from cartpole_rl.randomization.ranges import IdentifiedSettings
 from cartpole_rl.registry import Extension
 from cartpole_rl.reporting.loggers import LOGGERS
-from cartpole_rl.rig.hardware import hardware_of
-from cartpole_rl.rig.parameters import check_values
+from cartpole_rl.rig.parameters import RigSettings, check_cart, check_values
 from cartpole_rl.run_folder import BASELINE, is_own_policy
 from cartpole_rl.settings import Count, Finite, NonNegative, Positive, Seed, Settings
 from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, TaskSettings
@@ -384,7 +382,7 @@ class ExportConfig(Settings):
         if self.format == "firmware":
             if self.run is not None:
                 raise ValueError("run: format=firmware writes the numbers of a cart; leave it out")
-            hardware_of(self.cart or {})
+            check_cart(self.cart or {})
         elif self.cart is not None:
             raise ValueError(f"cart: format={self.format} exports an agent with its own cart; leave it out")
         elif self.run is None:

@@ -175,8 +175,9 @@ def record_experiments(config: IdentifyConfig, folder: Path) -> None:
 
 def make_plant(config: IdentifyConfig) -> SerialPlant:
     """Connect to the cart that is identified."""
+    pole = config.pole.heaviest.model_dump()
     plant: SerialPlant = config.plant.build(
-        config.emulator, config.control_period, "hanging", tqdm.write, confirm, cart=config.cart
+        config.emulator, config.control_period, "hanging", tqdm.write, confirm, {**config.cart, **pole}
     )
     return plant
 

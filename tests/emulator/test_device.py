@@ -231,6 +231,7 @@ def test_every_setting_is_tried_here_or_on_the_wire():
         "firmware",
         "policy",
         "hardware",
+        "given",
     }  # this module runs with both; test_onboard_policy.py, test_rigs.py
     others = {"journal", "knock"}  # tests/plants/test_stops.py, tests/fuzz/test_soak.py; below
     port = {"port"}  # tests/plants/serial/test_tcp.py

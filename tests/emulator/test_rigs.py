@@ -1,6 +1,7 @@
 """Carts with other encoders, tracks, masses and motors: both firmwares home them and count alike."""
 
 import math
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -12,10 +13,13 @@ pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
 from driven_cart import COARSE, Driven
 from firmwares import needs_compiler
 
+from cartpole_rl.composition import compose
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.rig.hardware import Hardware, hardware_of, nominal_hardware
 from cartpole_rl.wire import Fault, Flags, State
+from cartpole_rl.workflows.config import load_settings
+from cartpole_rl.workflows.emulate import EmulateConfig
 
 pytestmark = needs_compiler
 DEFAULT = EmulatorSettings()
@@ -131,6 +135,21 @@ def test_a_rig_survives_json_and_leaves_a_chosen_track() -> None:
     assert cart.track_half_length == 0.21
     assert EmulatorSettings.model_validate_json(cart.model_dump_json()) == cart
     assert EmulatorSettings().of_cart({}).track_half_length == DEFAULT.track_half_length
+
+
+def test_what_was_given_stays_though_it_is_the_default(tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text("cart_viscous: 0.65\n")
+    words = [f"emulator={tmp_path}/mine.yaml", "emulator.backdrivability=1.0", "cart=stepper"]
+    config = compose("emulate", words)
+    stepper = EmulatorSettings(**config["emulator"]).of_cart(config["cart"])
+    assert (stepper.backdrivability, stepper.cart_viscous) == (1.0, 0.65)
+    assert EmulatorSettings().of_cart(config["cart"]).backdrivability == 0.0
+    with pytest.raises(ConfigError, match="cart_mass is -1; it must be above 0"):
+        load_settings(EmulateConfig, ["cart=stepper", "cart.cart_mass=-1"])
+    with pytest.raises(
+        ConfigError, match=r"cart.hard_pus: there is no such setting; did you mean cart.hard_push"
+    ):
+        load_settings(EmulateConfig, ["+cart.hard_pus=3"])
 
 
 def test_another_rig_than_the_given_one_is_refused() -> None:

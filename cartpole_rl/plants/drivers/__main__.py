@@ -25,7 +25,7 @@ def main(text: str) -> int:
     settings = BOARDS.validate_python(given["plant"])
     hardware = Hardware.model_validate(given["hardware"])
     driver = settings.driver(settings, hardware.encoders)
-    bridge = Bridge(settings, hardware, driver, given["control_period"])
+    bridge = Bridge(settings, hardware, driver, given["control_period"], given["lever_um"])
     try:
         with until_stopped(), open_link("auto") as link:
             try:

@@ -18,7 +18,7 @@ from contextlib import suppress
 from dataclasses import replace
 from itertools import pairwise
 from operator import index
-from statistics import median
+from statistics import mean, median
 from threading import Lock, Thread
 
 from cartpole_rl.emulator.firmware import LARGEST_MOTOR, LONGEST_US, SHORTEST_US, Firmware
@@ -34,6 +34,8 @@ from cartpole_rl.signals import ending_signals
 from cartpole_rl.wire.messages import Fault, Message, Reason, SetPeriod, State
 
 LISTENED = 25  # measurements by which a board's period is known
+LISTENED_TO_ARRIVALS = 1.0  # s for a board that does not send its time
+FEW_LOST = 3  # gaps between two measurements, in medians: in longer ones the board was not heard
 PERIOD_TOLERANCE = 0.05  # share
 SAMPLES = 3  # measurements by which the limits know the speed
 LEAK = 0.01  # largest difference between the rates of the two clocks
@@ -75,9 +77,11 @@ class BoardClock:
 class StandIn(Firmware):
     """The firmware's rules for a board with its own firmware, whose measurements set the pace."""
 
-    def __init__(self, settings: BoardSettings, hardware: Hardware, board_us: int, driver: Driver) -> None:
-        """`board_us` is the time between two measurements."""
-        super().__init__(lambda: 0, hardware=hardware, samples=SAMPLES)
+    def __init__(
+        self, settings: BoardSettings, hardware: Hardware, board_us: int, driver: Driver, lever: int
+    ) -> None:
+        """`board_us` is the time between two measurements, `lever` that of `TrackLimits`, um."""
+        super().__init__(lambda: 0, lever_um=lever, hardware=hardware, samples=SAMPLES)
         self._settings, self._driver, self._board_us = settings, driver, board_us
         self.board_homes = False  # the board moves the cart by itself
         self.every = math.ceil(SHORTEST_US / board_us)  # measurements a control period
@@ -243,8 +247,14 @@ class Bridge:
     """One board between its driver and the port of `channel`. `run` returns when it is interrupted."""
 
     def __init__(
-        self, settings: BoardSettings, hardware: Hardware, driver: Driver, control_period: float | None
+        self,
+        settings: BoardSettings,
+        hardware: Hardware,
+        driver: Driver,
+        control_period: float | None,
+        lever: int,
     ) -> None:
+        self._lever = lever
         self._settings, self._hardware, self._driver = settings, hardware, driver
         self._lock = Lock()
         self._commands = MotorCommands(settings)
@@ -274,30 +284,51 @@ class Bridge:
             raise ConfigError(
                 "plant.homing=stops: cart= has end switches, which only its board reads; give hand or board"
             )
+        home, half_span = self._settings.home_position, self._hardware.half_span
+        if abs(home) >= half_span:
+            raise ConfigError(
+                f"plant.home_position={home:g} is beyond the track, which ends {half_span:g} m from the "
+                "middle: give metres from the middle, and the track in cart="
+            )
         self._driver.open()
         self._driver.stop()
-        stamps: list[int] = []
-        deadline = time.monotonic() + self._settings.connect_timeout
-        while len(stamps) < LISTENED:
-            measurement = self._driver.read(max(0.0, deadline - time.monotonic()))
-            if measurement is None:
-                came = f"only {len(stamps)} measurements came" if stamps else "no measurement comes"
-                raise LinkError(f"{came} from {self._settings.port}: {self._what_came()}")
-            stamps.append(self._now_us() if measurement.us is None else measurement.us)
-        board_us = round(median(after - before for before, after in pairwise(stamps)))
-        if board_us <= 0:
-            raise LinkError(
-                f"the time of {self._settings.port} does not advance: {stamps[-2]} us, then {stamps[-1]} us"
-            )
+        self._board_us = board_us = self._learn_period()
         if board_us > LONGEST_US:
             raise LinkError(
                 f"{self._settings.port} measures every {board_us / 1e3:.0f} ms; a pole needs at least one "
                 f"every {LONGEST_US / 1e3:.0f} ms: let the board send more often, or check time_unit"
             )
-        self._board_us = board_us
         self._stand_in = self._new_stand_in()
         if self._control_period is not None:
             self._stand_in.check_period(round(1e6 * self._control_period))
+
+    def _learn_period(self) -> int:
+        """Return the mean time between two measurements, us. Raises LinkError."""
+        stamps: list[int] = []
+        began = time.monotonic()
+        deadline = began + self._settings.connect_timeout + LISTENED_TO_ARRIVALS
+        arrivals = False
+        while len(stamps) < LISTENED or (arrivals and time.monotonic() < began + LISTENED_TO_ARRIVALS):
+            measurement = self._driver.read(max(0.0, deadline - time.monotonic()))
+            if measurement is None:
+                came = f"only {len(stamps)} measurements came" if stamps else "no measurement comes"
+                raise LinkError(f"{came} from {self._settings.port}: {self._what_came()}")
+            arrivals = measurement.us is None
+            stamps.append(self._now_us() if measurement.us is None else measurement.us)
+        gaps = [after - before for before, after in pairwise(stamps)]
+        if min(gaps) < 0 or not max(gaps):
+            raise LinkError(
+                f"the time of {self._settings.port} does not advance: {stamps[-2]} us, then {stamps[-1]} us"
+            )
+        middle = median(gaps)
+        if arrivals and middle < mean(gaps) / 2:
+            raise LinkError(
+                f"the measurements of {self._settings.port} come in bursts, so nobody knows when each was "
+                "made: let the board send its time, or set the latency of the USB adapter to 1 ms"
+            )
+        whole = [gap for gap in gaps if gap <= FEW_LOST * middle]
+        period = mean(whole)  # not the median: stamps may be in whole milliseconds
+        return round(sum(whole) / sum(max(1, round(gap / period)) for gap in whole))
 
     def run(self, channel: Channel) -> None:
         """Pass measurements and commands on; stop the board at the end. Raises LinkError when it is lost."""
@@ -450,7 +481,7 @@ class Bridge:
         self._potentiometer.forget()
 
     def _new_stand_in(self) -> StandIn:
-        return StandIn(self._settings, self._hardware, self._board_us, self._driver)
+        return StandIn(self._settings, self._hardware, self._board_us, self._driver, self._lever)
 
     def _command(self, silent: bool = False) -> None:
         """Send what drives the board, or what stops it, also while no measurement comes (`silent`)."""

@@ -271,7 +271,8 @@ class SerialCart:
             if now() > deadline:
                 self.stop()
                 raise PlantError(
-                    f"homing was not done after {timeout:g} s: clear the track, let the pole hang"
+                    f"homing was not done after {timeout:g} s: clear the track, let the pole hang, or give a "
+                    "longer plant.home_timeout for a long track"
                 )
             if microseconds_between(renewed_us, state.time_us) >= LEASE_RENEWAL_US:
                 self._connection.link.send(Hello())

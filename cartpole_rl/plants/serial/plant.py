@@ -13,6 +13,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from cartpole_rl.emulator.guards import LEVER, lever_um
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import ConfigError, FaultError, LinkError, PlantError, PortError
 from cartpole_rl.plants.emulated import BridgeProcess, EmulatedCart
@@ -31,6 +32,7 @@ from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.plants.settings import BoardSettings, EmulatedSettings, Rehome, SerialSettings
 from cartpole_rl.plants.specs import TERMINATING, TRUNCATING, Numbers, OneCartPlant, PlantOutput, on_tensors
 from cartpole_rl.rig.hardware import Hardware, hardware_of
+from cartpole_rl.rig.parameters import completed
 from cartpole_rl.tasks.episode import Ending
 from cartpole_rl.wire import Fault, Flags, State, seconds_between, ticks_between, went_back
 
@@ -340,10 +342,13 @@ def bridged_cart(
 ) -> SerialPlant:
     """Return the plant of plant=text and plant=driver, on a bridge that lives as long as the plant.
 
+    The brake knows the pole by the numbers of `cart`, if they include a pole's.
+
     Raises ConfigError if the board does not measure as often as the period needs, PortError, LinkError.
     """
-    hardware = hardware_of(cart or {})
-    bridge = BridgeProcess(plant, hardware, control_period)
+    hardware, numbers = hardware_of(cart or {}), completed(cart or {})
+    lever = lever_um(numbers) if {"cart_mass", "pole_mass", "pole_com"} <= numbers.keys() else LEVER
+    bridge = BridgeProcess(plant, hardware, control_period, lever)
     return SerialPlant(
         plant.over(bridge.port),
         start,

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from cartpole_rl.choices import choice
+from cartpole_rl.emulator.guards import LEVER, lever_um
 from cartpole_rl.emulator.homing import HomingError, Reading
 from cartpole_rl.emulator.process import until_stopped
 from cartpole_rl.errors import ConfigError, LinkError
@@ -17,6 +18,7 @@ from cartpole_rl.plants.drivers.bridge import CONFIRMED, STOPS, Bridge, MotorCom
 from cartpole_rl.plants.drivers.driver import Driver, Measurement
 from cartpole_rl.plants.settings import DriverSettings
 from cartpole_rl.rig.hardware import Encoders, hardware_of
+from cartpole_rl.rig.parameters import completed
 from cartpole_rl.wire import Fault
 
 RIG = hardware_of(choice("cart/stepper"))  # 25 um, 4096 counts a turn
@@ -73,7 +75,7 @@ class Playing(Bridge):
     def __init__(self, **given: Any) -> None:
         chosen = settings(**given)
         self.played, self.now = Played(chosen, RIG.encoders), 0
-        super().__init__(chosen, RIG, self.played, None)
+        super().__init__(chosen, RIG, self.played, None, LEVER)
         self._board_us, self._channel = PERIOD_US, Frames()  # type: ignore[assignment]
         self._stand_in = self._new_stand_in()
 
@@ -276,6 +278,43 @@ def test_few_measurements_are_counted_in_the_message() -> None:
     bridge.played.script = [Measurement(0, 0, PERIOD_US * number) for number in range(19)]
     with pytest.raises(LinkError, match="only 19 measurements came from x"):
         bridge.listen()
+
+
+@pytest.mark.parametrize(("true_us", "unit_us"), [(1667, 1000), (3333, 1000), (10_000, 1), (16_667, 1000)])
+def test_the_period_is_learnt_from_coarse_stamps_and_in_spite_of_lost_lines(
+    true_us: int, unit_us: int
+) -> None:
+    bridge = Playing()
+    stamps = [number * true_us // unit_us * unit_us for number in range(30) if number not in (7, 19, 20)]
+    bridge.played.script = [Measurement(0, 0, stamp) for stamp in stamps]
+    assert bridge._learn_period() == pytest.approx(true_us, rel=0.03)
+
+
+def test_measurements_without_a_time_that_come_in_bursts_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    bridge = Playing()
+    seconds = [0.016 * (number // 4) + 1e-5 * (number % 4) for number in range(400)]
+    bridge.played.script = [Measurement(0, 0, None) for _ in seconds]
+    clock = iter(seconds)
+    monkeypatch.setattr(bridge, "_now_us", lambda: round(1e6 * next(clock)))
+    monkeypatch.setattr("cartpole_rl.plants.drivers.bridge.LISTENED_TO_ARRIVALS", 0.0)
+    with pytest.raises(LinkError, match="come in bursts, so nobody knows when each was made"):
+        bridge.listen()
+
+
+@pytest.mark.parametrize("position", [0.3, -300.0])
+def test_a_board_is_not_sent_beyond_its_track(position: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    bridge = Playing(homing="board", home_position=position)
+    monkeypatch.setattr(Played, "home", lambda driver: None)
+    with pytest.raises(ConfigError, match=rf"home_position={position:g} is beyond the track"):
+        bridge.listen()
+    assert not bridge.played.sent
+
+
+def test_the_brake_knows_the_pole() -> None:
+    assert Playing()._stand_in._limits._lever == 27_000
+    large = {**choice("cart/ip02"), **choice("pole/large")["choices"]["large"]}
+    assert lever_um(completed(large)) == pytest.approx(81_400, rel=0.01)
+    assert lever_um({**completed(large), "backdrivability": 0.0}) == 0
 
 
 def test_a_driver_that_cannot_home_is_not_asked_to() -> None:

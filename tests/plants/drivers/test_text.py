@@ -127,7 +127,7 @@ def test_it_sends_lines(line: Line) -> None:
     line.driver.send(-12.4)
     line.driver.stop()
     assert line.sent(2) == b"-12\n0\n"
-    with closing(Line(line="a={:.2f}", stop_line="stop", home_line="home")) as other:
+    with closing(Line(line="a={:.2f}", stop_line="stop", home_line="home", homing="board")) as other:
         other.driver.send(1.234)
         other.driver.stop()
         other.driver.home()
@@ -162,6 +162,12 @@ REFUSED = {
     "a stepper at a stop": (
         {"full": 12, "sends": "acceleration", "line": "{:.3f}", "homing": "stops"},
         "a stepper loses steps at a stop",
+    ),
+    "a line to home by, by hand": ({"home_line": "home"}, "home_line is for homing=board"),
+    "a home, by hand": ({"home_position": 0.1}, "home_position is for homing=board, not homing=hand"),
+    "a unit without its column": (
+        {"columns": ["cart", "pole"], "time_unit": "ms"},
+        "time_unit is of the column time",
     ),
     "no line to home by": ({"homing": "board"}, "homing=board needs home_line"),
 }
