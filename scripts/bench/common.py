@@ -3,6 +3,7 @@
 import argparse
 import json
 import multiprocessing
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -138,6 +139,9 @@ def read_json(file: Path) -> Any:
 
 
 def write_json(file: Path | None, content: Any) -> None:
-    """Write `content` to a JSON file; do nothing without a file."""
+    """Write `content` to a JSON file, a list of numbers in a line; do nothing without a file."""
     if file:
-        file.write_text(json.dumps(content, indent=1) + "\n")
+        text = re.sub(
+            r"\[[^\[\]{}\"]+\]", lambda numbers: " ".join(numbers[0].split()), json.dumps(content, indent=1)
+        )
+        file.write_text(text + "\n")

@@ -109,63 +109,45 @@ def drive_missing(
 # figures
 
 
-def cart_figures(number: int, reference: float | None, scores: Scores) -> dict[str, Any]:
-    """Return the figures of one cart; `score` and `fraction` are None where they are not known."""
-    driven = [score for score in scores if score is not None]
-    score = float(np.mean(driven)) if driven else None
-    known = reference is not None and score is not None
-    return {
-        "cart": number,
-        "reference": reference,
-        "scores": scores,
-        "score": score,
-        "fraction": score / reference if known else None,
-        "beaten": known and max(driven) > reference,
-        "lost": sum(each < LOST_SCORE for each in driven),
-        "not_driven": len(scores) - len(driven),
-    }
-
-
-def agent_figures(run: str, carts: list[dict[str, Any]]) -> dict[str, Any]:
+def agent_figures(run: str, driven: dict[int, Scores], references: list[float | None]) -> dict[str, Any]:
     """Return the figures of one agent; a fraction is None if no cart has one."""
-    fractions = [cart["fraction"] for cart in carts if cart["fraction"] is not None]
-    episodes = sum(len(cart["scores"]) - cart["not_driven"] for cart in carts)
-    lost = sum(cart["lost"] for cart in carts)
+    known = {cart: [score for score in scores if score is not None] for cart, scores in driven.items()}
+    fractions, beaten = [], []
+    for cart, scores in sorted(known.items()):
+        if scores and (reference := references[cart]) is not None:
+            fractions.append(float(np.mean(scores)) / reference)
+            beaten += [cart] if max(scores) > reference else []
+    episodes = [score for scores in known.values() for score in scores]
+    lost = sum(score < LOST_SCORE for score in episodes)
     return {
         "run": run,
         "mean_fraction": float(np.mean(fractions)) if fractions else None,
         "worst_fraction": min(fractions, default=None),
         "lost": lost,
-        "lost_share": lost / episodes if episodes else None,
-        "not_driven": sum(cart["not_driven"] for cart in carts),
-        "beaten": sum(cart["beaten"] for cart in carts),
-        "episodes": episodes,
-        "carts": carts,
+        "lost_share": lost / len(episodes) if episodes else None,
+        "not_driven": sum(len(scores) for scores in driven.values()) - len(episodes),
+        "episodes": len(episodes),
+        "beaten": beaten,
+        "scores": {str(cart): driven[cart] for cart in sorted(driven)},
     }
 
 
 def all_figures(driven: Driven, references: list[float | None]) -> list[dict[str, Any]]:
     """Return the figures of every agent."""
-    return [
-        agent_figures(
-            run,
-            [cart_figures(number, references[number], carts[number]) for number in sorted(carts)],
-        )
-        for run, carts in driven.items()
-    ]
+    return [agent_figures(run, carts, references) for run, carts in driven.items()]
 
 
 def agent_row(agent: dict[str, Any]) -> dict[str, Cell]:
     """Return the table row of one agent."""
     return {
         "run": agent["run"],
-        "carts": len(agent["carts"]),
+        "carts": len(agent["scores"]),
         "mean fraction": agent["mean_fraction"],
         "worst cart": agent["worst_fraction"],
         "lost": agent["lost"],
         "lost share": agent["lost_share"],
         "not driven": agent["not_driven"],
-        "beaten": agent["beaten"],
+        "beaten": len(agent["beaten"]),
     }
 
 
@@ -182,7 +164,7 @@ def overall_rows(agents: list[dict[str, Any]]) -> list[dict[str, Cell]]:
 
 def note_beaten(agents: list[dict[str, Any]]) -> None:
     """Print how many references are too low, if any."""
-    if beaten := {cart["cart"] for agent in agents for cart in agent["carts"] if cart["beaten"]}:
+    if beaten := {cart for agent in agents for cart in agent["beaten"]}:
         numbers = ", ".join(map(str, sorted(beaten)))
         print(f"the references of {len(beaten)} truths are too low, an agent scored more: {numbers}")
 
@@ -198,7 +180,7 @@ def earlier_scores(file: Path | None, draw: dict[str, Any], count: int) -> Drive
     if others := [f"--{key} {known.get(key)}" for key in draw if known.get(key) != draw[key]]:
         raise SystemExit(f"{file} was made with {', '.join(others)}: use that, or another --json file")
     return {
-        agent["run"]: {cart["cart"]: cart["scores"] for cart in agent["carts"] if cart["cart"] < count}
+        agent["run"]: {int(cart): scores for cart, scores in agent["scores"].items() if int(cart) < count}
         for agent in known["agents"]
     }
 

@@ -135,9 +135,10 @@ def test_zero_shot_fractions_are_relative_to_the_reference_of_the_cart(
     found = figures(run, zero_shot, trained, *words)
     assert (found["seed"], found["wider"], found["starts"]) == (2026, 0, 2)
     (agent,) = found["agents"]
-    (cart,) = agent["carts"]
-    assert cart["fraction"] == agent["mean_fraction"] == pytest.approx(sum(cart["scores"]) / 2 / 100)
-    assert cart["lost"] == sum(score < 500 for score in cart["scores"])
+    (scores,) = agent["scores"].values()
+    assert agent["worst_fraction"] == agent["mean_fraction"] == pytest.approx(sum(scores) / 2 / 100)
+    assert agent["lost"] == sum(score < 500 for score in scores)
+    assert agent["beaten"] == [0] * (max(scores) > 100)
     with pytest.raises(SystemExit, match="was made with --seed 2026: use that, or another --json file"):
         figures(run, zero_shot, trained, *words, "--seed", "0")
 
