@@ -112,28 +112,45 @@ def cart_row(figures: dict[str, Any]) -> dict[str, Cell]:
     }
 
 
-def agent_row(agent: str, results: Sequence[dict[str, Any]]) -> dict[str, Cell]:
-    """Return the table row that summarizes the fine-tunings of one agent."""
+def agent_figures(agent: str, results: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return the figures that summarize the fine-tunings of one agent."""
     done = [each for each in results if "error" not in each]
-    if not done:
-        return {"agent": agent, "carts": 0, "not tuned": len(results)}
-    row: dict[str, Cell] = {"agent": agent, "carts": len(done), "not tuned": len(results) - len(done)}
-    for stage in ("before", "after"):
+    found: dict[str, Any] = {"run": agent, "not_tuned": len(results) - len(done)}
+    for stage in (Stage.BEFORE, Stage.AFTER) if done else ():
         scores = [each[stage] for each in done]
-        row |= {f"mean {stage}": f"{np.mean(scores):.0f}", f"worst {stage}": f"{min(scores):.0f}"}
         fractions = [each["fraction"][stage] for each in done if each["fraction"][stage] is not None]
-        row |= {
-            f"mean fraction {stage}": float(np.mean(fractions)) if fractions else None,
-            f"worst fraction {stage}": min(fractions, default=None),
+        found[str(stage)] = {
+            "mean_score": float(np.mean(scores)),
+            "worst_score": min(scores),
+            "mean_fraction": float(np.mean(fractions)) if fractions else None,
+            "worst_fraction": min(fractions, default=None),
         }
+    return found | {
+        "ended_below": sum(each["after"] < each["before"] for each in done),
+        "lost": {str(stage): sum(each["lost"][stage] for each in done) for stage in Stage},
+        "left_track": sum(each["left_track"] for each in done),
+        "left_track_first": sum(each["left_track_first"] for each in done),
+        "seconds": float(np.mean([each["seconds"] for each in done])) if done else None,
+        "carts": [{name: value for name, value in each.items() if name != "agent"} for each in results],
+    }
+
+
+def agent_row(figures: dict[str, Any]) -> dict[str, Cell]:
+    """Return the table row of one agent."""
+    row: dict[str, Cell] = {
+        "agent": figures["run"],
+        "carts": len(figures["carts"]) - figures["not_tuned"],
+        "not tuned": figures["not_tuned"],
+    }
+    for stage in (Stage.BEFORE, Stage.AFTER):
+        of_stage = figures.get(stage, {})
+        row |= {f"{name.replace('_', ' ')} {stage}": value for name, value in of_stage.items()}
     return row | {
-        "ended below": sum(each["after"] < each["before"] for each in done),
-        "lost before, tuning, after": ", ".join(
-            str(sum(each["lost"][stage] for each in done)) for stage in Stage
-        ),
-        "left track": sum(each["left_track"] for each in done),
-        "in first episode": sum(each["left_track_first"] for each in done),
-        "seconds a cart": f"{np.mean([each['seconds'] for each in done]):.0f}",
+        "ended below": figures["ended_below"],
+        "lost before, tuning, after": ", ".join(map(str, figures["lost"].values())),
+        "left track": figures["left_track"],
+        "in first episode": figures["left_track_first"],
+        "seconds a cart": figures["seconds"],
     }
 
 
@@ -191,13 +208,15 @@ def main() -> None:
             results[agent, number] = cart_figures(
                 agent, number, truths[number], references[number], done.result()
             )
-            write_json(options.json, [results[key] for key in jobs if key in results])
-    rows = [results[key] for key in jobs]
-    print_table([cart_row(each) for each in rows])
+            of_draw = {"seed": options.seed, "wider": options.wider}
+            agents = [
+                agent_figures(each, [results[key] for key in jobs if key[0] == each and key in results])
+                for each in options.agents
+            ]
+            write_json(options.json, {**of_draw, "agents": agents})
+    print_table([cart_row(results[key]) for key in jobs])
     print()
-    print_table(
-        [agent_row(agent, [each for each in rows if each["agent"] == agent]) for agent in options.agents]
-    )
+    print_table([agent_row(each) for each in agents])
 
 
 if __name__ == "__main__":

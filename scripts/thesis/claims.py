@@ -322,8 +322,8 @@ def _of_seeds(values: Array) -> str:
 def bench_values(folder: Path = BENCHES) -> dict[str, Array]:
     """Return the values of the benches' agents: learning/medium/failed, learning/range/1.0_m/fraction.
 
-    A file of learning.py has experiments, with the figures of each seed and of each of its poles; one of
-    zero_shot.py has a list of agents.
+    A file of learning.py has experiments, with the figures of each seed and of each of its poles; those of
+    zero_shot.py and fine_tuning.py have a list of agents.
     """
     found: dict[str, list[float]] = {}
 

@@ -82,13 +82,11 @@ def test_fine_tunings_are_compared_with_the_reference_of_the_cart() -> None:
     worse = fine_tuning.cart_figures("a", 1, {}, 4000.0, tuned([3600, 3600], [400, 3000]))
     failed = fine_tuning.cart_figures("a", 2, {}, None, {"error": "homing failed"})
     assert better["fraction"] == pytest.approx({"before": 0.82, "after": 0.9})
-    row = fine_tuning.agent_row("a", [better, worse, failed])
+    row = fine_tuning.agent_row(fine_tuning.agent_figures("a", [better, worse, failed]))
     assert (row["carts"], row["not tuned"], row["ended below"]) == (2, 1, 1)
-    assert (row["mean before"], row["worst after"], row["lost before, tuning, after"]) == (
-        "3850",
-        "1700",
-        "0, 2, 1",
-    )
+    assert (row["mean score before"], row["worst score after"]) == (3850, 1700)
+    assert row["lost before, tuning, after"] == "0, 2, 1"
+    assert fine_tuning.agent_row(fine_tuning.agent_figures("a", [failed]))["not tuned"] == 1
 
 
 def test_an_informed_agent_observes_its_own_cart() -> None:
