@@ -14,7 +14,6 @@ from cartpole_rl.plants.serial.port import set_exclusive
 from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.wire import Frame, FrameSplitter, Message, decode_frame, encode_frame
 
-POLLING = 1e-3  # s
 # Linux's has this name; macOS counts the time asleep in its CLOCK_MONOTONIC, and Windows in perf_counter
 _CLOCK: int | None = getattr(time, "CLOCK_BOOTTIME", getattr(time, "CLOCK_MONOTONIC", None))
 
@@ -86,15 +85,6 @@ class SerialLink:
             return self._port.in_waiting
         except OSError as error:
             raise self._broken("asked for bytes", error) from error
-
-    def await_byte(self, patience: float) -> bool:
-        """Return True as soon as a byte waits, False if none comes within `patience` s. Raises LinkError."""
-        deadline = now() + patience
-        while not self.waiting():
-            if now() >= deadline:
-                return False
-            time.sleep(POLLING)
-        return True
 
     def receive(self, waiting: int) -> list[Frame]:
         """Return the frames in the bytes that are `waiting`. Raises LinkError.
