@@ -165,8 +165,3 @@ def nominal_hardware() -> Hardware:
 def nominal_encoders() -> Encoders:
     """Return the encoders of ip02."""
     return nominal_hardware().encoders
-
-
-# of ip02, for recordings and pictures of one scale
-CART_METRES_PER_COUNT, POLE_COUNTS_PER_TURN = nominal_encoders()
-POLE_RADIANS_PER_COUNT = nominal_encoders().radians

@@ -11,7 +11,7 @@ from cartpole_rl.choices import choice
 from cartpole_rl.envs.perception import Percept, Previous, perceive, perceive_first, remember
 from cartpole_rl.envs.settings import ObservationSettings
 from cartpole_rl.plants.specs import PlantOutput
-from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT, nominal_encoders
+from cartpole_rl.rig.hardware import nominal_encoders
 from cartpole_rl.tasks.features import ANGULAR_SPEED_SCALE, MOTOR_SCALE, SPEED_SCALE
 from cartpole_rl.tasks.rewards import speed_periods
 from cartpole_rl.tasks.settings import RewardSettings, StartSettings, TaskSettings
@@ -77,7 +77,7 @@ def perceived(
 
 def test_velocities_are_differences_of_counts() -> None:
     state = perceived(frame()).state
-    x, theta = 100 * CART_METRES_PER_COUNT, 10 * POLE_RADIANS_PER_COUNT
+    x, theta = 100 * nominal_encoders().metres, 10 * nominal_encoders().radians
     torch.testing.assert_close(state[:, 0], torch.zeros(4))
     torch.testing.assert_close(state[:, 1], torch.tensor([x, x / 0.02, theta, theta / 0.02]))
 
@@ -147,5 +147,5 @@ def test_the_reward_has_its_scale_and_the_costs_of_the_track() -> None:
     costly = of_reward(scale=2.0, track_penalty=7.0, position_cost=3.0)
     later = frame(cart=5000, terminated=True)
     value, reward = (perceived(later, rewards=rewards).reward for rewards in (plain, costly))
-    nearness = (5000 * CART_METRES_PER_COUNT / 0.4) ** 2
+    nearness = (5000 * nominal_encoders().metres / 0.4) ** 2
     torch.testing.assert_close(reward, 2 * value - torch.tensor([[0.0, 7 + 3 * nearness]]))

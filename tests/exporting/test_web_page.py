@@ -19,7 +19,7 @@ from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.settings import SimulatedSettings
 from cartpole_rl.plants.simulated import Carts, Inputs, commands_under_way, run_carts
 from cartpole_rl.plants.specs import Numbers, OneCartPlant, PlantOutput
-from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
+from cartpole_rl.rig.hardware import nominal_encoders
 from cartpole_rl.scalar import Scalar
 from cartpole_rl.workflows.build import TrainedAgent, network_of
 from cartpole_rl.workflows.config import TrainConfig
@@ -91,7 +91,7 @@ class ExactPlant(OneCartPlant):
     def reset_one(self) -> PlantOutput[Numbers]:
         self.motion, self.drive = self.start, (0.0,) * (1 + self.commands)
         x, _, theta, _ = self.start
-        counts = round(x / CART_METRES_PER_COUNT), round(theta / POLE_RADIANS_PER_COUNT)
+        counts = round(x / nominal_encoders().metres), round(theta / nominal_encoders().radians)
         return PlantOutput(counts, (self.period,), (0,), (False,), (False,))
 
     def step_one(self, motor: int) -> PlantOutput[Numbers]:

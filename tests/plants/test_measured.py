@@ -17,7 +17,7 @@ from cartpole_rl.identification.experiments import recording
 from cartpole_rl.learning.finetuning import recorded_chunks
 from cartpole_rl.plants.measured import measured_part
 from cartpole_rl.plants.recorded import RecordedPlant
-from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, nominal_encoders
+from cartpole_rl.rig.hardware import nominal_encoders
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.wire import Fault
 from cartpole_rl.workflows.build import evaluated_env, evaluated_settings, trained_agent
@@ -89,7 +89,7 @@ def test_a_fault_is_a_truncation_without_the_tracks_penalty(
 
 def hanging(motor: Any, cart: Any, pole: Any) -> Episode:
     """A recording whose counts are given, the cart's in m."""
-    counts = np.stack(np.broadcast_arrays(np.rint(np.array(cart) / CART_METRES_PER_COUNT), pole), 1)
+    counts = np.stack(np.broadcast_arrays(np.rint(np.array(cart) / nominal_encoders().metres), pole), 1)
     motors = np.broadcast_to(motor, len(counts) - 1)
     gaps = np.full(len(motors), PERIOD)
     return recording(counts.astype(np.int64), gaps, motors, "time", nominal_encoders())

@@ -16,7 +16,7 @@ from cartpole_rl.physics.models import Models
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.randomization.ranges import Range
-from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
+from cartpole_rl.rig.hardware import nominal_encoders
 from cartpole_rl.tasks.settings import Start, StartSettings
 
 MakePlant = Callable[..., SimulatedPlant]
@@ -57,10 +57,10 @@ class TestFrame:
         plant = make_plant(64, cart={"angle_offset": 0.02}, start=ANYWHERE)
         for look in (plant.reset, lambda: push(plant, 200)):
             frame = look()
-            x = frame["counts"][:, 0] * CART_METRES_PER_COUNT - plant.true_state.x
-            theta = frame["counts"][:, 1] * POLE_RADIANS_PER_COUNT - plant.true_state.theta - 0.02
-            assert x.abs().max() <= 0.501 * CART_METRES_PER_COUNT
-            assert theta.abs().max() <= 0.501 * POLE_RADIANS_PER_COUNT
+            x = frame["counts"][:, 0] * nominal_encoders().metres - plant.true_state.x
+            theta = frame["counts"][:, 1] * nominal_encoders().radians - plant.true_state.theta - 0.02
+            assert x.abs().max() <= 0.501 * nominal_encoders().metres
+            assert theta.abs().max() <= 0.501 * nominal_encoders().radians
 
     def test_the_poles_turns_are_counted(self, make_plant: MakePlant) -> None:
         plant = make_plant(cart={"cart_mass": 100.0})

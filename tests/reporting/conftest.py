@@ -9,7 +9,7 @@ from small_study import made as made
 from small_study import study as study
 
 from cartpole_rl.identification.prediction import Replayed
-from cartpole_rl.rig.hardware import CART_METRES_PER_COUNT, POLE_RADIANS_PER_COUNT
+from cartpole_rl.rig.hardware import nominal_encoders
 from cartpole_rl.tasks.episode import Episode
 
 PERIOD = 0.02  # s
@@ -75,7 +75,7 @@ def as_episode(states: np.ndarray, motor: np.ndarray, ended_by: str) -> Episode:
         x_dot=x_dot,
         theta=theta,
         theta_dot=theta_dot,
-        counts=np.stack((x / CART_METRES_PER_COUNT, theta / POLE_RADIANS_PER_COUNT), 1).round().astype(int),
+        counts=np.rint(np.stack((x, theta), 1) / nominal_encoders().resolution).astype(int),
         motor=motor,
         score=score,
         score_upright=upright,
