@@ -141,6 +141,8 @@ def kinds(schema: type[Settings], field: str) -> list[str]:
 def no_such_setting(key: str, known: Iterable[str]) -> str:
     """Return the message for an unknown setting, with the most similar one if there is any."""
     above, _, wrong = key.rpartition(".")
+    if above == "parameters":
+        return f"{key}: numbers of the cart are given together, as 'parameters={{{wrong}:...}}'"
 
     def similar(setting: str) -> tuple[float, float]:
         place, _, name = setting.rpartition(".")

@@ -21,7 +21,7 @@ from cartpole_rl.exporting.agent import read_agent
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.errors import fault_error
 from cartpole_rl.plants.settings import SerialSettings
-from cartpole_rl.rig.hardware import hardware_of
+from cartpole_rl.rig.hardware import hardware_of, nominal_hardware
 from cartpole_rl.signals import RaiseOnce, ending_signals
 from cartpole_rl.wire import Flags, seconds_between
 
@@ -122,6 +122,7 @@ def main(file, port, pole_length="0"):
     encoders = {
         "cart_nanometres_per_count": round(1e9 * agent.cart_metres_per_count),
         "pole_counts_per_turn": agent.pole_counts_per_turn,
+        "track_span": 2 * (agent.track_half_length + nominal_hardware().soft_limit),
     }
     # a cart with end switches also needs its left_switch and right_switch here
     with SerialCart(SerialSettings(port=port), hardware_of(encoders)) as cart:

@@ -199,8 +199,9 @@ def grouped(sweeps: Sequence[Sweep]) -> tuple[list[Sweep], Columns]:
         name: [next(iter(values[start:stop]), NULL) for start, stop in bounds]
         for name, values in outer.items()
     }
+    evaluates = any(member.agent or member.run.agent for member in members)
     named, evaluations = _named(
-        {name: columns[name] for name in inner}, chosen, len(members), len(sweeps) == 1
+        {name: columns[name] for name in inner}, chosen, len(members), evaluates and len(sweeps) == 1
     )
     found = [
         replace(

@@ -61,8 +61,8 @@ GROUPS = {
 }
 DESCRIPTIONS = {
     "evaluation/score": "Mean score (6.2) of the greedy policy on nominal carts: judge a training by it.",
-    "evaluation/score_min": "Score (6.2) of the worst episode of an evaluation.",
-    "evaluation/score_max": "Score (6.2) of the best episode of an evaluation.",
+    "evaluation/score_min": "Score of the worst episode of an evaluation: (6.2), of a balance (6.1).",
+    "evaluation/score_max": "Score of the best episode of an evaluation: (6.2), of a balance (6.1).",
     "evaluation/seconds": "Seconds of training until this evaluation.",
     "exploration/episode_length": "Mean control periods of the episodes that ended since the last point.",
     "learning/loss": "Mean loss of the updates of an iteration.",

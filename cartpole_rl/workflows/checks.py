@@ -17,6 +17,7 @@ from cartpole_rl.choices import group_choices
 from cartpole_rl.envs.settings import shipped_carts
 from cartpole_rl.errors import CheckpointError, ConfigError
 from cartpole_rl.identification.settings import ImportConfig, log_files
+from cartpole_rl.plants.settings import emulated_pole
 from cartpole_rl.randomization.poles import Pole, check_one_pole
 from cartpole_rl.randomization.ranges import check_carts
 from cartpole_rl.rig.hardware import hardware_of, parameters_of
@@ -66,6 +67,7 @@ PACKAGES = {  # extra of this package: its modules, and their names
     "video": {"av": "PyAV"},
 }
 EXTRAS = {"onnx": "export", "minari": "minari", "mcap": "mcap"}  # of formats
+SIMILAR_MASS = 0.2  # share by which an emulated pole may differ from the stated one
 MINARI_FILE = "main_data.hdf5"
 TAKEN_BY_REPEAT = ("run", "repeat.run", "repeat.episode", "label", "view")
 
@@ -199,6 +201,20 @@ def check_identification(config: IdentifyConfig) -> None:
     check_values(config.nominal)
     if config.source is not None:
         experiments(config.source)
+    elif config.plant.reads_emulator:
+        check_emulated_pole(config)
+
+
+def check_emulated_pole(config: IdentifyConfig) -> None:
+    """Raise ConfigError if the emulated cart has another pole than the one that is stated."""
+    stated, carried = config.pole.nominal, emulated_pole(config.emulator)
+    if stated.is_about(carried.length) and abs(stated.pole_mass / carried.pole_mass - 1) < SIMILAR_MASS:
+        return
+    words = " ".join(f"emulator.{name}={value:g}" for name, value in stated)
+    raise ConfigError(
+        f"pole: it has {stated.length:.3g} m and {stated.pole_mass:.3g} kg, and the emulated cart carries "
+        f"one of {carried.length:.3g} m and {carried.pole_mass:.3g} kg; give that as pole=, or {words}"
+    )
 
 
 def check_resumable(program: str, resume: str, folder: Path) -> None:

@@ -28,7 +28,8 @@ from cartpole_rl.learning.states import seed_everything
 from cartpole_rl.randomization.poles import Pole, PoleSettings
 from cartpole_rl.reporting.texts import guard_text
 from cartpole_rl.reporting.web_view import chosen_view
-from cartpole_rl.run_folder import CONFIG, METRICS, check_program
+from cartpole_rl.rig.hardware import hardware_of
+from cartpole_rl.run_folder import BASELINE, CONFIG, METRICS, check_program, is_own_policy
 from cartpole_rl.tasks.episode import Episode, Origin
 from cartpole_rl.terminal import confirm, print_message, progress_bar, waiting
 from cartpole_rl.workflows.build import (
@@ -42,6 +43,7 @@ from cartpole_rl.workflows.build import (
     precedence,
     predicting_env,
     provenance,
+    trained_agent,
     use_threads,
 )
 from cartpole_rl.workflows.checks import note_other_numbers, simulated_carts
@@ -220,10 +222,27 @@ def repetition(config: EvaluateConfig) -> Repetition | None:
         raise ConfigError(
             f"repeat.run={run}: its {METRICS} has no cart for each episode; evaluate again"
         ) from None
+    if config.run != BASELINE and not is_own_policy(config.run):
+        check_same_cart(config, recorded["evaluated"])
     batch_number = (recorded.get("repeat") or {}).get("episode")
     evaluation = same_evaluation(config, recorded, origin)
     row = (number if batch_number is None else batch_number) % simulated_carts(evaluation)
     return Repetition(evaluation, origin, row, metrics["episodes"][number]["score"])
+
+
+def check_same_cart(config: EvaluateConfig, evaluated: Mapping[str, Any]) -> None:
+    """Raise ConfigError unless the agent has the encoders, track and period of what was `evaluated`."""
+    training, driven = trained_agent(config.run).training, hardware_of(evaluated["cart"]).scales_text
+    if driven != training.hardware.scales_text:
+        raise ConfigError(
+            f"repeat.run={config.repeat.run}: its cart has {driven}, that of the agent "
+            f"{training.hardware.scales_text}; give an agent of that cart"
+        )
+    if (period := evaluated["control_period"]) != training.control_period:
+        raise ConfigError(
+            f"repeat.run={config.repeat.run}: it was driven every {1e3 * period:g} ms, and the agent drives "
+            f"every {1e3 * training.control_period:g} ms; give an agent of that period"
+        )
 
 
 def read_evaluation(run: Path) -> tuple[dict[str, Any], dict[str, Any]]:

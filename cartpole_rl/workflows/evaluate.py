@@ -1,5 +1,6 @@
 """Drive whole episodes of a trained agent, in simulation or on a cart, and report their scores."""
 
+import sys
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
@@ -98,7 +99,8 @@ def next_command(evaluation: Evaluation) -> str:
     config, known = evaluation.config, evaluation.known_poles
     run, plant = as_word("run", shown(config.run)), plant_words(config.plant, config.emulator, known)
     if config.run == BASELINE:
-        return "cartpole-train experiment=medium"
+        of_cart = [word for word in sys.argv[1:] if word.startswith(("cart=", "pole=", "control_period="))]
+        return " ".join(["cartpole-train", *(of_cart or ["experiment=medium"])])
     if not config.plant.is_on_port:
         poles = known if config.pole is None and known else [evaluation.settings.pole]
         return f"cartpole-evaluate {run} {emulated_words(poles)}"

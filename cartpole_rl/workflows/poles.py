@@ -90,7 +90,7 @@ def plant_words(
     default, pole = EmulatorSettings(), emulated_pole(emulator)
     if known and pole == emulated_pole(default) and not knows(known, one_pole(pole)):
         pole = emulated_pole(files.get(emulator_for(known) or "", default))
-    driven = emulator.model_copy(update={**pole.model_dump(), "policy": None})
+    driven = emulator.model_copy(update={**pole.model_dump(), "policy": None, "given": ()})
     choices = [
         [f"emulator={name}"] * bool(name) + changed_words("emulator", driven, file.model_dump())
         for name, file in {"": default, **files}.items()

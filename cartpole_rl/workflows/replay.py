@@ -21,6 +21,7 @@ from cartpole_rl.reporting.predictions import REPORTED_TIMES, replay_figure, rep
 from cartpole_rl.reporting.style import save
 from cartpole_rl.reporting.texts import count_text
 from cartpole_rl.reporting.web_view import WebView
+from cartpole_rl.rig.hardware import nominal_hardware
 from cartpole_rl.rig.parameters import check_names, check_values
 from cartpole_rl.run_folder import FIGURES, recordings, write_config, write_json
 from cartpole_rl.terminal import as_word, print_results, shown
@@ -72,6 +73,8 @@ def replay_recordings(config: ReplayConfig, folder: Path) -> None:
     if away:
         print(replay_table(away, "the same away from upright; near it an error grows e times in 0.15 s"))
     of_cart = [word for word in sys.argv[1:] if word.startswith(("cart=", "pole="))]
+    if settings.hardware != nominal_hardware() and not any(word.startswith("cart=") for word in of_cart):
+        of_cart.append("cart=<yours>.yaml")
     following = ["cartpole-model", as_word("from", shown(config.source)), *of_cart]
     print_results(folder, f"{REPLAY} and {FIGURE}", " ".join(following))
     if config.view == "web":

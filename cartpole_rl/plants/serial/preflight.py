@@ -46,7 +46,7 @@ ROUND_TRIP_SHARE = 0.5  # of a period: a command that comes later acts in the ne
 
 SURELY_MOVED = 0.001  # m
 POLE_MOVED = 1.25  # degrees; more, where the pole still swings
-PUSH = 60  # motor values above the dead-band: about 1.5 m/s^2
+PUSH = 1.4  # m/s^2, of a push in the middle
 LONGEST_PUSH, FARTHEST_PUSH = 0.3, 0.035  # s, m
 DRIFT = 4  # periods over which a remaining swing is measured
 NO_SWING, LONG_PATIENCE = 0.5, 15.0  # degrees peak to peak, s
@@ -285,6 +285,13 @@ def cart_direction(probe: Probe) -> str:
     return f"motor value {value:+d} moves the count up"
 
 
+def push_motor(probe: "Probe", side: int) -> int:
+    """Return the size of a motor value that pushes the cart gently to a side, beyond its dead-band."""
+    hardware = probe.hardware
+    push = PUSH * hardware.moving_mass * hardware.motor_per_newton
+    return min(gentle_motor(hardware), probe.deadband[side] + round(push))
+
+
 def pole_direction(probe: Probe) -> str:
     """Check that a push to the right leaves the hanging pole's tip behind, on the left: its count goes up.
 
@@ -294,7 +301,7 @@ def pole_direction(probe: Probe) -> str:
     states, swing = probe.calm(no_swing, LONG_PATIENCE)
     before, drift = states[-1], (states[-1].pole_counts - states[-1 - DRIFT].pole_counts) / DRIFT
     enough = max(probe.pole_counts(POLE_MOVED), no_swing + swing // 2)
-    value = min(gentle_motor(probe.hardware), probe.deadband[RIGHT] + PUSH)
+    value = push_motor(probe, RIGHT)
     for period in range(1, probe.periods(LONGEST_PUSH) + 1):
         after = probe.drive(value)
         swung = round(after.pole_counts - before.pole_counts - drift * period)
@@ -353,7 +360,7 @@ def step_latency(probe: Probe, side: int) -> tuple[float, float]:
     two states during the motion give that start more precisely than a period.
     """
     before = probe.settle()
-    value = side * min(gentle_motor(probe.hardware), probe.deadband[side] + PUSH)
+    value = side * push_motor(probe, side)
     moved = probe.cart_counts(MOVED)
     states = [probe.drive(value)]
     age = states[0].command_age_ms * 1e-3
