@@ -28,7 +28,7 @@ ENDED = 1  # the status of a preflight that is not ready
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a person who has written the files of the page."""
     folder = tmp_path_factory.mktemp("mine")
-    for name in ("mine.yaml", "my_pole.yaml", "board.yaml"):
+    for name in ("mine.yaml", "my_pole.yaml", "my_emulator.yaml", "board.yaml"):
         block = re.search(rf"`{name}`.*?\n\n((?:    [^\n]*\n)+)", TEXT, re.S)
         assert block
         (folder / name).write_text(re.sub(r"^    ", "", block[1], flags=re.M))
