@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 from cartpole_rl.choices import choice
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.rig.hardware import LARGEST_MOTOR, Hardware, hardware_of, nominal_hardware
-from cartpole_rl.rig.parameters import completed
+from cartpole_rl.rig.parameters import check_cart, completed
 from cartpole_rl.settings import Fraction, NonNegative, Positive, Settings
 
 Share = Annotated[
@@ -116,6 +116,7 @@ class EmulatorSettings(Settings):
         that differs from the file as the default cart differs from ip02's. A file with ip02's hardware
         changes nothing. Raises ConfigError for another rig than `hardware`.
         """
+        check_cart(cart)
         hardware, of_ip02 = hardware_of(cart), choice("cart/ip02")
         if self.hardware == hardware or (self.hardware is None and hardware == nominal_hardware()):
             return self

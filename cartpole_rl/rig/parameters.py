@@ -200,7 +200,7 @@ class RigSettings(Settings):
     @model_validator(mode="after")
     def _the_cart_is_possible(self) -> Self:
         try:
-            check_cart(self.cart)
+            hardware_of(self.cart)
         except ConfigError as error:
             raise ValueError(str(error)) from None
         return self

@@ -18,8 +18,6 @@ from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.rig.hardware import Hardware, hardware_of, nominal_hardware
 from cartpole_rl.wire import Fault, Flags, State
-from cartpole_rl.workflows.config import load_settings
-from cartpole_rl.workflows.emulate import EmulateConfig
 
 pytestmark = needs_compiler
 DEFAULT = EmulatorSettings()
@@ -145,11 +143,11 @@ def test_what_was_given_stays_though_it_is_the_default(tmp_path: Path) -> None:
     assert (stepper.backdrivability, stepper.cart_viscous) == (1.0, 0.65)
     assert EmulatorSettings().of_cart(config["cart"]).backdrivability == 0.0
     with pytest.raises(ConfigError, match="cart_mass is -1; it must be above 0"):
-        load_settings(EmulateConfig, ["cart=stepper", "cart.cart_mass=-1"])
+        EmulatorSettings().of_cart({"cart_mass": -1.0})
     with pytest.raises(
         ConfigError, match=r"cart.hard_pus: there is no such setting; did you mean cart.hard_push"
     ):
-        load_settings(EmulateConfig, ["+cart.hard_pus=3"])
+        EmulatorSettings().of_cart({"hard_pus": 3.0})
 
 
 def test_another_rig_than_the_given_one_is_refused() -> None:
