@@ -195,6 +195,11 @@ def _write(text: str) -> None:
         sys.stderr.flush()
 
 
+def words_given(*settings: str) -> list[str]:
+    """Return the words of the command line that choose these settings."""
+    return [word for word in sys.argv[1:] if word.partition("=")[0] in settings]
+
+
 def print_results(folder: Path, files: str, following: str) -> None:
     """Print that `files` are in `folder`, and the command `following`."""
     print(f"{shown(folder)}/{files} are written; next:")

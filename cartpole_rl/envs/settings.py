@@ -13,8 +13,8 @@ from cartpole_rl.physics.models import Models
 from cartpole_rl.plants.settings import SimulationSettings
 from cartpole_rl.randomization.poles import Pole, PoleSettings
 from cartpole_rl.randomization.ranges import IdentifiedSettings, Range
-from cartpole_rl.rig.hardware import hardware_of, nominal_hardware, parameters_of
-from cartpole_rl.rig.parameters import RigSettings, completed
+from cartpole_rl.rig.hardware import RigSettings, hardware_of, nominal_hardware, parameters_of
+from cartpole_rl.rig.parameters import completed
 from cartpole_rl.settings import Finite, NonNegative, Positive, Settings
 from cartpole_rl.tasks.features import ObservationKind
 from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, TaskSettings

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.rig.parameters import RigSettings
+from cartpole_rl.rig.hardware import RigSettings
 from cartpole_rl.settings import Count, Finite, NonNegative, Positive, Settings
 
 

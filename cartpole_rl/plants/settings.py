@@ -406,7 +406,7 @@ class TextSettings(BoardSettings):
 
     @model_validator(mode="after")
     def _a_time_has_a_column(self) -> Self:
-        if "time" not in self.columns and "time_unit" in self.model_fields_set and self.time_unit != "us":
+        if "time" not in self.columns and self.time_unit != "us":
             raise ValueError("time_unit is of the column time, which columns does not name; leave it out")
         return self
 

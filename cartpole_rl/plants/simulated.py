@@ -157,13 +157,18 @@ class SimulatedPlant(Plant):
             torch.zeros(4, carts, device=self.device),
             torch.zeros(1 + commands, carts, device=self.device),
         )
+        self._cart = CartParameters(self._carts.table)  # its fields share the table's memory
         check_laws(models, CartParameters(randomizer.nominal.unsqueeze(1)))
         self.set_seed(seed)
 
     @property
     def parameters(self) -> CartParameters:
         """The parameters in force, [N]; they change in place when a row resets: clone them to keep them."""
-        return CartParameters(self._carts.table)  # its fields share the table's memory
+        return self._cart
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Share the table's memory again, which a pickle does not keep."""
+        self.__dict__.update(state, _cart=CartParameters(state["_carts"].table))
 
     @property
     def true_state(self) -> State:

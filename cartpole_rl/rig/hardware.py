@@ -14,7 +14,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from cartpole_rl.choices import choice
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.settings import NonNegative, Positive, Settings
+from cartpole_rl.settings import Finite, NonNegative, Positive, Settings
 
 LARGEST_MOTOR = 255  # motor value in size, to the left (negative) and to the right
 
@@ -165,3 +165,22 @@ def nominal_hardware() -> Hardware:
 def nominal_encoders() -> Encoders:
     """Return the encoders of ip02."""
     return nominal_hardware().encoders
+
+
+class RigSettings(Settings):
+    """A cart's file: parameters of its motion, and its hardware."""
+
+    cart: dict[str, Finite]
+
+    @model_validator(mode="after")
+    def _hardware_is_possible(self) -> Self:
+        try:
+            hardware_of(self.cart)
+        except ConfigError as error:
+            raise ValueError(str(error)) from None
+        return self
+
+    @property
+    def hardware(self) -> Hardware:
+        """The encoders, track and motor of the cart."""
+        return hardware_of(self.cart)

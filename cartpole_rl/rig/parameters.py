@@ -10,14 +10,11 @@ A row of a simulated cart belongs to the entry of the same place, also in checkp
 
 import math
 from collections.abc import Iterable, Mapping
-from typing import NamedTuple, Self
-
-from pydantic import model_validator
+from typing import NamedTuple
 
 from cartpole_rl.checking import most_similar
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.rig.hardware import HARDWARE, LARGEST_MOTOR, Hardware, hardware_of, parameters_of
-from cartpole_rl.settings import Finite, Settings
+from cartpole_rl.rig.hardware import HARDWARE, LARGEST_MOTOR, hardware_of, parameters_of
 
 
 class Bound(NamedTuple):
@@ -190,22 +187,3 @@ def check_cart(cart: Mapping[str, float]) -> None:
             nearest = most_similar(name, [*PARAMETERS, *HARDWARE])
             raise ConfigError(f"cart.{name}: there is no such setting; did you mean cart.{nearest}?")
         check_value(name, value)
-
-
-class RigSettings(Settings):
-    """A cart's file: parameters of its motion, and its hardware."""
-
-    cart: dict[str, Finite]
-
-    @model_validator(mode="after")
-    def _the_cart_is_possible(self) -> Self:
-        try:
-            hardware_of(self.cart)
-        except ConfigError as error:
-            raise ValueError(str(error)) from None
-        return self
-
-    @property
-    def hardware(self) -> Hardware:
-        """The encoders, track and motor of the cart."""
-        return hardware_of(self.cart)

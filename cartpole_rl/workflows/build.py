@@ -250,16 +250,16 @@ def replaced_settings(training: TrainConfig, config: EvaluateConfig) -> CartPole
     if config.actions is not None:
         check_same_meaning(config.actions, training.actions)
     if config.cart is not None and config.run != BASELINE and not is_own_policy(config.run):
-        check_same_rig(hardware_of(config.cart), training.hardware)
+        check_same_rig("cart", hardware_of(config.cart), training.hardware)
     settings = validated(CartPoleSettings, {**own, **given, "randomization": config.randomization})
     return with_parameters(settings, config.parameters or {})
 
 
-def check_same_rig(given: Hardware, trained: Hardware) -> None:
-    """Raise ConfigError unless an agent drives a cart with the encoders and the track of its training."""
+def check_same_rig(setting: str, given: Hardware, trained: Hardware) -> None:
+    """Raise ConfigError, which names the setting, unless a rig has the encoders and track of the training."""
     if given.scales_text != trained.scales_text:
         raise ConfigError(
-            f"cart: it has {given.scales_text}, but the agent was trained for {trained.scales_text}; "
+            f"{setting}: it has {given.scales_text}, but the agent was trained for {trained.scales_text}; "
             "train one for this cart"
         )
 

@@ -45,7 +45,8 @@ from cartpole_rl.randomization.poles import PoleSettings, check_one_pole
 from cartpole_rl.randomization.ranges import IdentifiedSettings
 from cartpole_rl.registry import Extension
 from cartpole_rl.reporting.loggers import LOGGERS
-from cartpole_rl.rig.parameters import RigSettings, check_cart, check_values
+from cartpole_rl.rig.hardware import RigSettings
+from cartpole_rl.rig.parameters import check_cart, check_values
 from cartpole_rl.run_folder import BASELINE, is_own_policy
 from cartpole_rl.settings import Count, Finite, NonNegative, Positive, Seed, Settings
 from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, TaskSettings

@@ -2,8 +2,7 @@
 
 from cartpole_rl.choices import choice
 from cartpole_rl.emulator.settings import EmulatorSettings
-from cartpole_rl.rig.hardware import nominal_hardware, parameters_of
-from cartpole_rl.rig.parameters import RigSettings
+from cartpole_rl.rig.hardware import RigSettings, nominal_hardware, parameters_of
 from cartpole_rl.terminal import print_message
 
 

@@ -34,6 +34,7 @@ from cartpole_rl.tasks.episode import Episode, Origin
 from cartpole_rl.terminal import confirm, print_message, progress_bar, waiting
 from cartpole_rl.workflows.build import (
     TrainedAgent,
+    check_same_rig,
     compiled_training,
     evaluated_agent,
     evaluated_env,
@@ -232,12 +233,8 @@ def repetition(config: EvaluateConfig) -> Repetition | None:
 
 def check_same_cart(config: EvaluateConfig, evaluated: Mapping[str, Any]) -> None:
     """Raise ConfigError unless the agent has the encoders, track and period of what was `evaluated`."""
-    training, driven = trained_agent(config.run).training, hardware_of(evaluated["cart"]).scales_text
-    if driven != training.hardware.scales_text:
-        raise ConfigError(
-            f"repeat.run={config.repeat.run}: its cart has {driven}, that of the agent "
-            f"{training.hardware.scales_text}; give an agent of that cart"
-        )
+    training = trained_agent(config.run).training
+    check_same_rig(f"repeat.run={config.repeat.run}", hardware_of(evaluated["cart"]), training.hardware)
     if (period := evaluated["control_period"]) != training.control_period:
         raise ConfigError(
             f"repeat.run={config.repeat.run}: it was driven every {1e3 * period:g} ms, and the agent drives "

@@ -1,6 +1,5 @@
 """Drive whole episodes of a trained agent, in simulation or on a cart, and report their scores."""
 
-import sys
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
@@ -24,7 +23,7 @@ from cartpole_rl.run_folder import (
     write_config,
 )
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.terminal import as_word, print_loop_time, print_results, shown
+from cartpole_rl.terminal import as_word, print_loop_time, print_results, shown, words_given
 from cartpole_rl.workflows.checks import agent_file
 from cartpole_rl.workflows.config import EvaluateConfig
 from cartpole_rl.workflows.episodes import Evaluation, Repetition, prepared
@@ -99,8 +98,8 @@ def next_command(evaluation: Evaluation) -> str:
     config, known = evaluation.config, evaluation.known_poles
     run, plant = as_word("run", shown(config.run)), plant_words(config.plant, config.emulator, known)
     if config.run == BASELINE:
-        of_cart = [word for word in sys.argv[1:] if word.startswith(("cart=", "pole=", "control_period="))]
-        return " ".join(["cartpole-train", *(of_cart or ["experiment=medium"])])
+        of_cart = words_given("cart", "pole", "control_period") or ["experiment=medium"]
+        return " ".join(["cartpole-train", *of_cart])
     if not config.plant.is_on_port:
         poles = known if config.pole is None and known else [evaluation.settings.pole]
         return f"cartpole-evaluate {run} {emulated_words(poles)}"

@@ -4,7 +4,6 @@ The simulated cart is reset to the measured state every `restart` seconds: over 
 diverge.
 """
 
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,7 @@ from cartpole_rl.reporting.web_view import WebView
 from cartpole_rl.rig.hardware import nominal_hardware
 from cartpole_rl.rig.parameters import check_names, check_values
 from cartpole_rl.run_folder import FIGURES, recordings, write_config, write_json
-from cartpole_rl.terminal import as_word, print_results, shown
+from cartpole_rl.terminal import as_word, print_results, shown, words_given
 from cartpole_rl.workflows.build import recorded_cart
 from cartpole_rl.workflows.checks import note_other_numbers
 from cartpole_rl.workflows.config import ReplayConfig, TrainConfig, load_settings
@@ -72,9 +71,8 @@ def replay_recordings(config: ReplayConfig, folder: Path) -> None:
     print(replay_table(errors, f"errors of {count}, pole={name}, over the time since a reset"))
     if away:
         print(replay_table(away, "the same away from upright; near it an error grows e times in 0.15 s"))
-    of_cart = [word for word in sys.argv[1:] if word.startswith(("cart=", "pole="))]
-    if settings.hardware != nominal_hardware() and not any(word.startswith("cart=") for word in of_cart):
-        of_cart.append("cart=<yours>.yaml")
+    needs_cart = settings.hardware != nominal_hardware() and not words_given("cart")
+    of_cart = [*["cart=<yours>.yaml"] * needs_cart, *words_given("cart", "pole")]
     following = ["cartpole-model", as_word("from", shown(config.source)), *of_cart]
     print_results(folder, f"{REPLAY} and {FIGURE}", " ".join(following))
     if config.view == "web":

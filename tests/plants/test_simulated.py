@@ -1,6 +1,7 @@
 """The simulated plant: encoders, delays, draws in each episode, and going on from a snapshot."""
 
 import math
+import pickle
 import shutil
 from collections.abc import Callable
 
@@ -187,6 +188,11 @@ class TestSnapshot:
         for again in (plant, make_plant(**settings, seed=99)):
             again.restore(snapshot)
             assert (self.course(again, motors[30:]) == first).all()
+
+
+def test_a_pickled_plant_reads_the_carts_that_it_draws(make_plant: MakePlant) -> None:
+    copy = pickle.loads(pickle.dumps(make_plant(3)))
+    assert copy.parameters.table.data_ptr() == copy._carts.table.data_ptr()
 
 
 def test_more_substeps_change_little(make_plant: MakePlant) -> None:

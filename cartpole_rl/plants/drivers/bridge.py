@@ -316,17 +316,17 @@ class Bridge:
             arrivals = measurement.us is None
             stamps.append(self._now_us() if measurement.us is None else measurement.us)
         gaps = [after - before for before, after in pairwise(stamps)]
-        if min(gaps) < 0 or not max(gaps):
+        middle = median(gaps)
+        if middle <= 0:
             raise LinkError(
                 f"the time of {self._settings.port} does not advance: {stamps[-2]} us, then {stamps[-1]} us"
             )
-        middle = median(gaps)
         if arrivals and middle < mean(gaps) / 2:
             raise LinkError(
                 f"the measurements of {self._settings.port} come in bursts, so nobody knows when each was "
                 "made: let the board send its time, or set the latency of the USB adapter to 1 ms"
             )
-        whole = [gap for gap in gaps if gap <= FEW_LOST * middle]
+        whole = [gap for gap in gaps if 0 <= gap <= FEW_LOST * middle]
         period = mean(whole)  # not the median: stamps may be in whole milliseconds
         return round(sum(whole) / sum(max(1, round(gap / period)) for gap in whole))
 

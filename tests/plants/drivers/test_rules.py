@@ -290,6 +290,17 @@ def test_the_period_is_learnt_from_coarse_stamps_and_in_spite_of_lost_lines(
     assert bridge._learn_period() == pytest.approx(true_us, rel=0.03)
 
 
+def test_one_damaged_stamp_does_not_hide_the_period_and_a_clock_that_stands_is_refused() -> None:
+    bridge = Playing()
+    stamps = [10_000 * number for number in range(25)]
+    stamps[12] = 7_000_000
+    bridge.played.script = [Measurement(0, 0, stamp) for stamp in stamps]
+    assert bridge._learn_period() == 10_000
+    bridge.played.script = [Measurement(0, 0, number // 3) for number in range(25)]
+    with pytest.raises(LinkError, match="the time of x does not advance"):
+        bridge._learn_period()
+
+
 def test_measurements_without_a_time_that_come_in_bursts_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     bridge = Playing()
     seconds = [0.016 * (number // 4) + 1e-5 * (number % 4) for number in range(400)]
