@@ -260,6 +260,23 @@ def test_homing_ends_early(page: str, tmp_path: Path, event: str, words: str) ->
 
 
 @needs_browser
+def test_an_agent_that_is_told_the_length_asks_whether_it_is_right(page: str, tmp_path: Path) -> None:
+    asked = """
+    WIRE.needsLength = true;
+    element("connect").click();
+    await until(() => real?.asking || real?.done);
+    const asked = real.line;
+    real.end("stopped by hand");
+    await until(() => real.done);
+    report([asked, 0, 0]);
+    """
+    line, _ = answer(page, asked, tmp_path)
+    assert line.startswith(
+        "Is your pole 0.36 m long? If not, disconnect and choose its length. The cart moves by"
+    )
+
+
+@needs_browser
 def test_a_number_that_is_not_finite_ends_it(page: str, tmp_path: Path) -> None:
     broken = "await until(() => real.answered >= 10 || real.done); LAYERS[0].bias[0] = Infinity;"
     line, _ = answer(page, f"{DRIVEN} {broken} {ENDED}", tmp_path, answers=True)

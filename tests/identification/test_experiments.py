@@ -43,10 +43,9 @@ from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.plants.specs import Numbers, PlantOutput
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.rig.hardware import (
-    CART_METRES_PER_COUNT,
-    POLE_COUNTS_PER_TURN,
     Hardware,
     hardware_of,
+    nominal_encoders,
     nominal_hardware,
 )
 from cartpole_rl.tasks.episode import Episode
@@ -389,7 +388,7 @@ class TestChecks:
             (
                 {
                     "theta": lambda theta: 2 * np.pi - theta,
-                    "pole": lambda counts: POLE_COUNTS_PER_TURN - counts,
+                    "pole": lambda counts: nominal_encoders().turn - counts,
                 },
                 "swap the pole encoder's channels",
             ),
@@ -402,7 +401,7 @@ class TestChecks:
         most = 9000
         saturated = changed(
             recordings["excite"],
-            x=lambda x: x.clip(-most * CART_METRES_PER_COUNT, most * CART_METRES_PER_COUNT),
+            x=lambda x: x.clip(-most * nominal_encoders().metres, most * nominal_encoders().metres),
             cart=lambda counts: counts.clip(-most, most),
         )
         message = refused(recordings, excite=saturated)

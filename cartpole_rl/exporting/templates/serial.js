@@ -338,7 +338,7 @@ class SerialCart {
 
   /** Wait until the reader agrees that the cart moves. HELLO keeps an emulated cart without a clock going. */
   async consent(found) {
-    const length = `Is your pole ${this.cart.poleLength.toFixed(2)} m long? If not, disconnect and choose its length. `;
+    const length = `Is your pole ${this.cart.poleLength[0].toFixed(2)} m long? If not, disconnect and choose its length. `;
     const asked = `${found}${WIRE.needsLength ? length : ""}`;
     this.line = `${asked}The cart moves by itself while it homes: keep the track clear, let the pole hang.`;
     this.agreed = false;
