@@ -215,8 +215,10 @@ def test_mujocos_toolbox_finds_the_cart_that_moved() -> None:
 def test_a_motor_whose_logs_are_too_short_is_refused(tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.setattr(real, "MOTORS_2020", {"short": ("*.csv", ("layout.angle.upright=3000",))})
     time = np.arange(0, 8, 0.005)
-    angle, position = 3000 + 300 * np.sin(9 * time), 1000 * np.sin(3 * time)
-    rows = np.stack((time, angle.round(), position.round(), (4000 * np.cos(5 * time)).round()), 1)
+    late = time - 0.01  # s, of the acceleration behind the motor value
+    angle, motor = 3000 + 300 * np.sin(9 * time), 2000 * (np.cos(5 * time) + np.cos(11 * time))
+    position = -20_000 * (np.cos(5 * late) / 5**2 + np.cos(11 * late) / 11**2)
+    rows = np.stack((time, angle.round(), position.round(), motor.round()), 1)
     for name in ("a_short.csv", "b_short.csv"):
         head = "time,angle,position,actualMotorCmd"
         np.savetxt(tmp_path / name, rows, fmt="%.6g", delimiter=",", header=head, comments="")
