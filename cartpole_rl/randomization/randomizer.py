@@ -18,7 +18,7 @@ from cartpole_rl.errors import ConfigError
 from cartpole_rl.physics.parameters import CartParameters, cart_column
 from cartpole_rl.randomization.poles import Pole, PoleSettings, possible_poles, uniform_rod
 from cartpole_rl.randomization.ranges import Range, check_carts
-from cartpole_rl.tasks.settings import Start, StartSettings
+from cartpole_rl.tasks.settings import CENTRED, Start, StartSettings
 
 POLE_FIELDS = tuple(Pole.model_fields)
 
@@ -188,7 +188,11 @@ def draw_start(count: int, start: StartSettings, generator: torch.Generator) -> 
     if start.resting_share == 0:
         return state
     rests = torch.rand((count, 1), generator=generator, device=device) < start.resting_share
-    return torch.where(rests, torch.addcmul(*bounds(start, device, resting=True), unit), state)
+    resting = torch.addcmul(*bounds(start, device, resting=True), unit)
+    if start.centred_share > 0:
+        centred = torch.rand((count, 1), generator=generator, device=device) < start.centred_share
+        resting[:, :1] = torch.where(centred, CENTRED * unit[:, :1], resting[:, :1])
+    return torch.where(rests, resting, state)
 
 
 @cache

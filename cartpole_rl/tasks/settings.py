@@ -30,6 +30,9 @@ class ActionSettings(Settings):
         return self
 
 
+CENTRED = 0.01  # m: homing ends at least so near the middle
+
+
 class Start(StrEnum):
     """The initial angle of the pole."""
 
@@ -47,6 +50,7 @@ class StartSettings(Settings):
     speed_spread: NonNegative  # m/s
     angular_speed_spread: NonNegative  # rad/s
     resting_share: Fraction = 0.0  # of the episodes start with a hanging pole at rest
+    centred_share: Fraction = 0.0  # of these start within CENTRED of the middle, as after homing
 
 
 class RewardSettings(Settings):

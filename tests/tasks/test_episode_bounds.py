@@ -11,7 +11,7 @@ from cartpole_rl.randomization.randomizer import draw_start
 from cartpole_rl.tasks.episode import is_upright, upright_since, wrap
 from cartpole_rl.tasks.features import Measured
 from cartpole_rl.tasks.rewards import BALANCE_ANGLE
-from cartpole_rl.tasks.settings import Start, StartSettings
+from cartpole_rl.tasks.settings import CENTRED, Start, StartSettings
 
 SPREAD = {"position_spread": 0.2, "angle_spread": 0.1, "speed_spread": 0.3, "angular_speed_spread": 1.0}
 
@@ -46,6 +46,13 @@ class TestStarts:
         torch.testing.assert_close(state[rests, 2], torch.full_like(state[rests, 2], math.pi))
         assert state[rests, 0].abs().max() > 0.19
         assert state[~rests, 2].abs().max() < math.pi + 1e-6
+
+    def test_a_share_of_these_starts_in_the_middle(self) -> None:
+        state = draw(Start.ANY, resting_share=0.5, centred_share=0.4)
+        rests = (state[:, 1] == 0) & (state[:, 3] == 0)
+        centred = state[:, 0].abs() <= CENTRED
+        assert centred[rests].double().mean().item() == pytest.approx(0.4 + 0.6 * CENTRED / 0.2, abs=0.02)
+        assert centred[~rests].double().mean().item() == pytest.approx(CENTRED / 0.2, abs=0.02)
 
     def test_the_generator_decides(self) -> None:
         assert (draw(Start.ANY) == draw(Start.ANY)).all()
