@@ -40,7 +40,7 @@ RIG = {  # macros of cart_rig.h
     "CART_SWITCHES": "end switches: 0 none, 1 left, 2 right, 3 both",
 }
 LONGEST_ANSWER = 70  # bytes: 2 * CART_FRAME_BYTES
-SNAPSHOT_NUMBERS = 93
+SNAPSHOT_NUMBERS = 96
 
 
 class CartHead(ctypes.Structure):

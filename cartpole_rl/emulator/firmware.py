@@ -9,6 +9,7 @@ since boot.
 
 from collections import deque
 from collections.abc import Callable, Generator
+from dataclasses import replace
 
 from cartpole_rl.emulator.guards import (
     FASTEST_CART,
@@ -23,7 +24,7 @@ from cartpole_rl.emulator.guards import (
     micrometres,
     nearest_count,
 )
-from cartpole_rl.emulator.homing import Homing, HomingError, Reading, Zeros
+from cartpole_rl.emulator.homing import SHORTEST_LOOK, Homing, HomingError, Reading, Zeros
 from cartpole_rl.emulator.settings import LARGEST_MOTOR
 from cartpole_rl.errors import FrameError
 from cartpole_rl.rig.hardware import Hardware, nominal_hardware
@@ -315,7 +316,7 @@ class Firmware:
                 self.armed, self._homing = False, None
                 self._line.stop(now_us)
             case Home():
-                self.homed, self._homing = False, self._home()
+                self.homed, self._homing, self._waited_us = False, self._home(), 0
                 next(self._homing)
                 self._line.hold(0)
                 self._limits.release()
@@ -334,6 +335,10 @@ class Firmware:
 
     def _step_homing(self, homing: Generator[int, Reading, Zeros], reading: Reading) -> None:
         """Let homing choose the motor value, or end it with its zeros or a fault."""
+        self._waited_us += reading.us
+        if self._waited_us < SHORTEST_LOOK:
+            return
+        reading, self._waited_us = replace(reading, us=self._waited_us), 0
         try:
             self._line.hold(homing.send(reading))
         except StopIteration as end:

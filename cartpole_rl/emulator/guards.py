@@ -36,8 +36,10 @@ LEFT, RIGHT = 1, 2  # bits of end switches
 STALL_US = 500_000
 STALL_UM = 1000
 PUSH_US = 100_000  # of such pushes one way, after which the count must have changed
-SPEED_CHANGE = 200_000  # um/s; 0.2 m/s turn any pole by several counts
-ROUNDING_US = 1250  # such a change is at least a count in this time, four in the shortest period
+SPEED_CHANGE = 200_000  # um/s, for one look; 0.2 m/s then turn any pole by two counts
+LOOK_US = (
+    62_000_000  # over the counts of a turn: 15 ms for 4096; one count of a pole as long as 1 m is 2 pi m
+)
 FASTEST_CART = 5_000_000_000  # nm/s; 5 m/s: over twice the motor's reach
 FASTEST_POLE = 16  # turns/s; five times a fast swing
 
@@ -96,23 +98,26 @@ class FrozenCartWatch:
     """Detects a cart count that does not change under hard pushes in both directions.
 
     Under a push one way only, the cart itself may be held by a stop or an obstacle. An
-    obstacle on one side lets the cart move the other way, by at least one count. The period in which a push
-    begins does not count: pushes that change their direction in each period may move nothing.
+    obstacle on one side lets the cart move the other way, by at least one count. The beginning of a push does
+    not count, until 2 m/s^2 would have moved the cart by two counts: short pushes may move nothing.
     """
 
     def __init__(self, hardware: Hardware) -> None:
         self._hard_push = hardware.hard_push
         self._count: int | None = None
         self._direction = 0  # of the present push: 1, -1, or 0 for none
+        self._lasts_us = 0  # its length up to the newest count, at most PUSH_US
+        self._square = 2000 * hardware.cart_nanometres_per_count  # us^2, of the beginning of a push
         self._pushed_us = {1: 0, -1: 0}  # in each direction since the count changed, at most PUSH_US
 
     def frozen(self, cart: int, motor: int, us: int) -> bool:
         """Return whether the encoder is frozen, after `us` under `motor` that ended at count `cart`."""
         direction = 0 if abs(motor) < self._hard_push else 1 if motor > 0 else -1
-        lasted, self._direction = direction != 0 and direction == self._direction, direction
+        before_us = self._lasts_us if direction == self._direction else 0
+        self._direction, self._lasts_us = direction, min(PUSH_US, before_us + us)
         if cart != self._count:
             self._count, self._pushed_us = cart, {1: 0, -1: 0}
-        elif lasted:
+        elif direction != 0 and before_us**2 >= self._square:
             self._pushed_us[direction] = min(PUSH_US, self._pushed_us[direction] + us)
         return min(self._pushed_us.values()) >= PUSH_US
 
@@ -121,26 +126,34 @@ class FrozenPoleWatch:
     """Detects a pole count that does not change while the cart speeds up by 0.2 m/s and slows down again.
 
     Gravity can hold a pole still in an accelerating cart only at one angle for each acceleration, so never
-    at the same angle during an opposite acceleration.
+    at the same angle during an opposite acceleration. The speed is the mean of a *look*, which is long enough
+    for the change to turn the pole by two counts.
     """
 
     def __init__(self, hardware: Hardware) -> None:
         self._nanometres = hardware.cart_nanometres_per_count
-        self._change = max(SPEED_CHANGE, self._nanometres * 1000 // ROUNDING_US)
+        self._look_us = LOOK_US // hardware.pole_counts_per_turn
+        self._change = max(SPEED_CHANGE, 4 * self._nanometres * 1000 // self._look_us)
         self._pole: int | None = None
-        self._cart: int | None = None
-        self._lowest = self._highest = 0  # cart speed in um/s since the pole's count changed
+        self._cart = 0  # its count when the present look began
+        self._elapsed_us = 0  # of this look
+        self._moved = False  # a look has ended since the pole's count changed
+        self._lowest = self._highest = 0  # cart speed in um/s since then
         self._rise = self._fall = 0  # largest increase and decrease of that speed
 
     def frozen(self, pole: int, cart: int, us: int) -> bool:
         """Return whether the pole's encoder is frozen, `us` after the last counts."""
-        last, self._cart = self._cart, cart
-        if last is None:
-            return False
-        speed = (cart - last) * self._nanometres * 1000 // us
         if pole != self._pole:
-            self._pole, self._lowest, self._highest = pole, speed, speed
-            self._rise = self._fall = 0
+            self._pole, self._cart, self._elapsed_us = pole, cart, 0
+            self._moved, self._lowest, self._highest, self._rise, self._fall = False, 0, 0, 0, 0
+            return False
+        self._elapsed_us += us
+        if self._elapsed_us < self._look_us:
+            return False
+        speed = (cart - self._cart) * self._nanometres * 1000 // self._elapsed_us
+        self._cart, self._elapsed_us = cart, 0
+        if not self._moved:
+            self._moved, self._lowest, self._highest = True, speed, speed
         self._lowest, self._highest = min(self._lowest, speed), max(self._highest, speed)
         self._rise = max(self._rise, speed - self._lowest)
         self._fall = max(self._fall, self._highest - speed)

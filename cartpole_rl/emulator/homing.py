@@ -3,7 +3,8 @@
 An end is a stop that holds the cart or, on a rig with end switches, the place where one is pressed. A side
 without a switch is then not visited: it is one span from the other.
 
-Homing works on raw encoder counts, one reading per tick, and needs only rough numbers of the cart (motor
+Homing works on raw encoder counts, one reading every 15 ms or more: in less, a coarse encoder tells no speed.
+It needs only rough numbers of the cart (motor
 curve, mass and friction in `Hardware`), as firmware does. Distances and times are whole numbers of counts,
 nanometres and microseconds; the speed servo and the brake compute in SI units, positive to the right. A
 procedure is a generator: it receives a `Reading`, yields the motor value until the next one, and returns its
@@ -33,6 +34,7 @@ STANDS = 300_000  # nm, largest motion in that time, or one count
 LONGEST_SEARCH = 30_000_000, 20  # us for one stop; at least so many for a um of the track
 LONGEST_LEAVING = 5_000_000  # us to move off a switch, for which a second is usual
 CENTRED = 1_000_000  # nm
+CROSSES = 0.1  # m/s, up to which a cart that crosses the middle between two readings is centred
 LONGEST_CENTRING = 20_000_000, 5  # the same for the way to the middle
 
 WHOLE_SWING = 2_000_000  # us: one period of a rod of 1.5 m
@@ -42,7 +44,8 @@ LONGEST_BRAKING = 20_000_000  # us
 PATIENCE = 20_000_000  # us, after which NEARLY_STILL is sufficient, for a pole with hardly any friction
 NEARLY_STILL = 350  # hundredths of a degree, peak to peak
 LONGEST_WAIT = 60_000_000  # us
-LONGEST_WINDOW = WHOLE_SWING // 5_000 + 1  # counts at the shortest period, plus one
+SHORTEST_LOOK = 15_000  # us between two readings; with shorter periods, as many as reach it
+LONGEST_WINDOW = WHOLE_SWING // SHORTEST_LOOK + 1  # counts
 
 TUNED_MASS = 0.85  # kg of cart and pole, for which the next number and the servo's gains were chosen
 NEGLIGIBLE = 0.02  # N, below which the motor stays off
@@ -313,8 +316,10 @@ class Homing:
         servo, elapsed, before, start = SpeedServo(self._hardware), 0, reading, reading.cart
         while elapsed < self._longest_centring:
             self._check_switches(reading)
-            away = middle - reading.cart
-            if abs(away) * self._nanometres < CENTRED:
+            away, past = middle - reading.cart, middle - before.cart
+            speed = (reading.cart - before.cart) * self._metres / reading.seconds
+            crosses = (away < 0) != (past < 0) and abs(speed) <= CROSSES
+            if crosses or abs(away) * self._nanometres < CENTRED:
                 return reading
             if pole_speed(before, reading) > self._fast:
                 start = reading.cart
@@ -322,7 +327,6 @@ class Homing:
                 raise HomingError("the cart moves away from the middle")
             speed_here = away * self._metres  # m/s: it slows down over the last second
             target = max(-TRAVEL_SPEED, min(TRAVEL_SPEED, speed_here))
-            speed = (reading.cart - before.cart) * self._metres / reading.seconds
             before = reading
             reading = yield servo.motor(target, speed, reading.seconds)
             elapsed += reading.us

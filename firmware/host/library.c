@@ -97,6 +97,7 @@ static void add_core(list *all, const cart *self)
     add(all, self->seen);
     add(all, self->procedure.pressed);
     add(all, self->procedure.pressed_at);
+    add(all, self->homing ? self->procedure.waited_us : 0);
 }
 
 static void add_limits(list *all, const cart *self)
@@ -138,12 +139,14 @@ static void add_guards(list *all, const cart_guards *guards)
     add(all, cart_freezes->counted);
     add(all, cart_freezes->count);
     add(all, cart_freezes->direction);
+    add(all, cart_freezes->lasts_us);
     add(all, cart_freezes->right_us);
     add(all, cart_freezes->left_us);
-    add(all, pole_freezes->moved);
-    add(all, pole_freezes->cart);
     add(all, pole_freezes->counted);
     add(all, pole_freezes->pole);
+    add(all, pole_freezes->cart);
+    add(all, pole_freezes->elapsed_us);
+    add(all, pole_freezes->moved);
     add(all, pole_freezes->lowest);
     add(all, pole_freezes->highest);
     add(all, pole_freezes->rise);

@@ -317,8 +317,13 @@ static void check_faults(cart *self, const cart_reading *reading)
 /* Let homing choose the motor value, or end it with its zeros or a fault. */
 static void step_homing(cart *self, const cart_reading *reading)
 {
+    self->procedure.waited_us += reading->period_us;
+    if (self->procedure.waited_us < CART_SHORTEST_LOOK_US)
+        return;
+    const cart_reading look = {reading->cart, reading->pole, self->procedure.waited_us};
+    self->procedure.waited_us = 0;
     int16_t motor = 0;
-    switch (cart_homing_step(&self->procedure, reading, &motor)) {
+    switch (cart_homing_step(&self->procedure, &look, &motor)) {
     case CART_HOMING_GOES_ON:
         cart_line_hold(&self->line, motor);
         break;

@@ -7,8 +7,10 @@
 #define STALL_US 500000u
 #define STALL_COUNTS CART_COUNTS(1000)
 #define PUSH_US 100000u        /* of hard pushes one way, after which the count must have changed */
-#define ROUNDING_UM_S (CART_NANOMETRES * 1000LL / 1250) /* um/s: four counts in the shortest period */
-#define SPEED_CHANGE (ROUNDING_UM_S > 200000 ? ROUNDING_UM_S : 200000) /* 0.2 m/s turn any pole by several counts */
+#define PUSH_SQUARE (2000LL * CART_NANOMETRES) /* us^2, of its beginning: until 2 m/s^2 move a cart by two counts */
+#define LOOK_US (62000000 / CART_POLE_COUNTS)  /* in it 0.2 m/s turn any pole by two counts; 15 ms for 4096 a turn */
+#define ROUNDING_UM_S (4 * CART_NANOMETRES * 1000LL / LOOK_US) /* um/s: four counts of the cart in a look */
+#define SPEED_CHANGE (ROUNDING_UM_S > 200000 ? ROUNDING_UM_S : 200000)
 #define FASTEST_CART (5000000000LL / CART_NANOMETRES) /* counts/s: 5 m/s */
 #define FASTEST_POLE (16LL * CART_POLE_COUNTS)        /* counts/s: 16 turns a second */
 #define SECOND_US 1000000LL
@@ -62,13 +64,14 @@ bool cart_pole_jumped(cart_jump_watch *watch, int32_t pole, uint32_t period_us)
 bool cart_cart_frozen(cart_frozen_cart_watch *watch, int32_t cart, int16_t motor, uint32_t period_us)
 {
     int8_t direction = push(motor);
-    bool lasted = direction != 0 && direction == watch->direction; /* the push began before this period */
+    int64_t before_us = direction == watch->direction ? watch->lasts_us : 0;
     watch->direction = direction;
+    watch->lasts_us = (uint32_t)(before_us + period_us < PUSH_US ? before_us + period_us : PUSH_US);
     if (!watch->counted || cart != watch->count) {
         watch->counted = true;
         watch->count = cart;
         watch->right_us = watch->left_us = 0;
-    } else if (lasted) {
+    } else if (direction != 0 && before_us * before_us >= PUSH_SQUARE) {
         uint32_t *pushed_us = direction > 0 ? &watch->right_us : &watch->left_us;
         uint32_t left_us = PUSH_US - *pushed_us;
         *pushed_us += period_us < left_us ? period_us : left_us;
@@ -78,19 +81,20 @@ bool cart_cart_frozen(cart_frozen_cart_watch *watch, int32_t cart, int16_t motor
 
 bool cart_pole_frozen(cart_frozen_pole_watch *watch, int32_t pole, int32_t cart, uint32_t period_us)
 {
-    bool first = !watch->moved;
-    int64_t counts = (int64_t)cart - watch->cart;
-    watch->moved = true;
-    watch->cart = cart;
-    if (first)
-        return false;
-    int64_t speed = cart_floor_divide(counts * CART_NANOMETRES * 1000, (int64_t)period_us);
     if (!watch->counted || pole != watch->pole) {
-        watch->counted = true;
-        watch->pole = pole;
-        watch->lowest = watch->highest = speed;
-        watch->rise = watch->fall = 0;
+        *watch = (cart_frozen_pole_watch){.counted = true, .pole = pole, .cart = cart};
+        return false;
     }
+    watch->elapsed_us += period_us;
+    if (watch->elapsed_us < LOOK_US)
+        return false;
+    int64_t counts = (int64_t)cart - watch->cart;
+    int64_t speed = cart_floor_divide(counts * CART_NANOMETRES * 1000, (int64_t)watch->elapsed_us);
+    watch->cart = cart;
+    watch->elapsed_us = 0;
+    if (!watch->moved)
+        watch->lowest = watch->highest = speed;
+    watch->moved = true;
     watch->lowest = speed < watch->lowest ? speed : watch->lowest;
     watch->highest = speed > watch->highest ? speed : watch->highest;
     if (speed - watch->lowest > watch->rise)

@@ -24,14 +24,16 @@ typedef struct {
     bool counted; /* `count` is a count */
     int32_t count;
     int8_t direction;           /* of the present push: 1, -1, or 0 for none */
+    uint32_t lasts_us;          /* its length up to the newest count, not beyond the time that is needed */
     uint32_t right_us, left_us; /* of pushes since the count changed, not beyond the time that is needed */
 } cart_frozen_cart_watch;
 
 typedef struct {
-    bool moved;   /* `cart` is a count */
-    bool counted; /* `pole` is a count, and the speeds below are set */
-    int32_t cart, pole;
-    int64_t lowest, highest; /* cart speed in um/s since the pole's count changed */
+    bool counted; /* `pole` and `cart` are counts */
+    bool moved;   /* a look has ended since the pole's count changed */
+    int32_t pole, cart;      /* counts; `cart` when the present look began */
+    uint32_t elapsed_us;     /* of this look */
+    int64_t lowest, highest; /* cart speed in um/s since then */
     int64_t rise, fall;      /* largest increase and decrease of that speed */
 } cart_frozen_pole_watch;
 

@@ -24,6 +24,7 @@
 #define LONGEST_SEARCH_US (CART_SPAN_UM > 1500000 ? CART_SPAN_UM * 20u : 30000000u) /* for one stop */
 #define LONGEST_LEAVING_US 5000000u /* to move off a switch, for which a second is usual */
 #define CENTRED_NM 1000000
+#define CROSSES 0.1 /* m/s, up to which a cart that crosses the middle between two readings is centred */
 #define LONGEST_CENTRING_US (CART_SPAN_UM > 4000000 ? CART_SPAN_UM * 5u : 20000000u)
 
 #define WHOLE_SWING_US 2000000u /* one period of a rod of 1.5 m */
@@ -66,6 +67,7 @@ static void enter(cart_homing *homing, cart_homing_stage stage)
 void cart_homing_begin(cart_homing *homing)
 {
     enter(homing, CART_SWITCHES ? CART_LEAVE_SWITCH : CART_TOUCH_LEFT);
+    homing->waited_us = 0;
 }
 
 /* Count the time of a stage; return true for its first reading. */
@@ -196,7 +198,9 @@ static outcome centre(cart_homing *homing, const cart_reading *reading, int16_t 
     if (homing->elapsed_us >= LONGEST_CENTRING_US || (CART_SWITCHES && switches_lie(homing, reading->cart)))
         return FAILS;
     int32_t middle = cart_zeros_middle(&homing->zeros);
-    if (cart_distance(middle, reading->cart) * CART_NANOMETRES < CENTRED_NM)
+    double speed = cart_speed(homing, reading);
+    bool crosses = (middle < reading->cart) != (middle < homing->before.cart) && speed <= CROSSES && speed >= -CROSSES;
+    if (crosses || cart_distance(middle, reading->cart) * CART_NANOMETRES < CENTRED_NM)
         return ENDS;
     if (pole_speed(homing, reading) > FAST_POLE)
         homing->start = reading->cart;
@@ -204,7 +208,6 @@ static outcome centre(cart_homing *homing, const cart_reading *reading, int16_t 
     if (added * CART_NANOMETRES > ASTRAY_NM)
         return FAILS;
     double target = cart_limit(metres(reading->cart, middle), TRAVEL_SPEED); /* slows down over a second */
-    double speed = cart_speed(homing, reading);
     homing->before = *reading;
     *motor = cart_servo_motor(&homing->servo, target, speed, seconds(reading));
     return YIELDS;

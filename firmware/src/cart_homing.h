@@ -3,7 +3,7 @@
    An end is a stop that holds the cart or, on a rig with end switches, the place where one is pressed. A side without
    a switch is then not visited: it is one span from the other.
 
-   One step a period, on raw counts. It needs only rough numbers of the cart. The pole's zero is the middle of
+   One reading every 15 ms or more, on raw counts: in less, a coarse encoder tells no speed. It needs only rough numbers of the cart. The pole's zero is the middle of
    its last small swing: friction in the bearing holds a stopped pole up to a count off the vertical. */
 #ifndef CART_HOMING_H
 #define CART_HOMING_H
@@ -43,6 +43,7 @@ typedef enum {
 typedef struct {
     cart_homing_stage stage;
     bool entered;        /* the stage has handled a reading */
+    uint32_t waited_us;  /* since the last reading */
     uint8_t pressed;     /* switches at the newest two looks, also without homing: a single look may be noise */
     uint8_t suspects;    /* switches for which homing failed */
     uint32_t elapsed_us; /* since the stage began */
@@ -59,7 +60,7 @@ typedef struct {
 /* Begin. Nothing is taken from an earlier homing: its zeros may be why the cart is homed again. */
 void cart_homing_begin(cart_homing *homing);
 
-/* Handle the reading of a period and choose the motor value for the next one. */
+/* Handle a reading, CART_SHORTEST_LOOK_US or more after the last one, and choose the motor value for the next one. */
 cart_homing_status cart_homing_step(cart_homing *homing, const cart_reading *reading, int16_t *motor);
 
 /* Count in the middle of the track, and counts from there to a stop. */

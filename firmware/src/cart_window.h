@@ -8,7 +8,8 @@
 #include <stdint.h>
 
 #define CART_LONGEST_WINDOW_US 2000000u
-#define CART_WINDOW_COUNTS (CART_LONGEST_WINDOW_US / CART_SHORTEST_US + 1)
+#define CART_SHORTEST_LOOK_US 15000u /* between two counts; with shorter periods, as many as reach it */
+#define CART_WINDOW_COUNTS (CART_LONGEST_WINDOW_US / CART_SHORTEST_LOOK_US + 1)
 
 typedef struct {
     uint32_t length_us;

@@ -42,6 +42,7 @@ def core(firmware: Any) -> list[int]:
         firmware._seen,
         firmware._pressed,
         firmware._pressed_at,
+        firmware._waited_us if firmware.homing else 0,
     ]
 
 
@@ -82,12 +83,14 @@ def guards(firmware: Any) -> list[int]:
         carts._count is not None,
         carts._count or 0,
         carts._direction,
+        carts._lasts_us,
         carts._pushed_us[1],
         carts._pushed_us[-1],
-        poles._cart is not None,
-        poles._cart or 0,
         poles._pole is not None,
         poles._pole or 0,
+        poles._cart,
+        poles._elapsed_us,
+        poles._moved,
         poles._lowest,
         poles._highest,
         poles._rise,

@@ -1,6 +1,8 @@
 """Carts with other encoders, tracks, masses and motors: both firmwares home them and count alike."""
 
+import itertools
 import math
+import random
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +16,11 @@ from driven_cart import COARSE, Driven
 from firmwares import needs_compiler
 
 from cartpole_rl.composition import compose
+from cartpole_rl.emulator.guards import FrozenCartWatch, FrozenPoleWatch
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.rig.hardware import Hardware, hardware_of, nominal_hardware
-from cartpole_rl.wire import Fault, Flags, State
+from cartpole_rl.wire import Fault, Flags, SetMotor, SetPeriod, Start, State
 
 pytestmark = needs_compiler
 DEFAULT = EmulatorSettings()
@@ -121,10 +124,44 @@ def test_the_longest_track_is_searched_to_its_end() -> None:
     check_homes(EmulatorSettings(**COARSE).of_cart({"track_span": 6.0}))
 
 
-def test_the_coarsest_encoders_are_fine_enough() -> None:
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("period_us", [5_000, 20_000, 100_000])
+def test_the_coarsest_encoders_are_fine_enough(period_us: int, seed: int) -> None:
     rig = hardware_of({"cart_nanometres_per_count": 600_000, "pole_counts_per_turn": 200})
-    driven, state = home(EmulatorSettings(**COARSE).of_cart(rig.model_dump()), "python")
+    light = {"pole_viscous": 3e-4, "pole_coulomb": 1e-4}  # a bearing that leaves the braking to the cart
+    cart = EmulatorSettings(**COARSE, **light, seed=seed, boot="anywhere").of_cart(rig.model_dump())
+    driven = Driven(**cart.model_dump())
+    driven.ask(SetPeriod(period_us))
+    state = driven.home()
     assert (driven.flags, state.fault) == (Flags.HOMED, Fault.NONE)
+    assert state.time_us < 50e6
+    if period_us > 20_000:
+        return
+    dice, faults = random.Random(seed), Fault.NONE
+    driven.ask(Start())
+    for push in range(400):  # short ones, one way and then the other
+        motor = dice.choice([200, 255]) * (1 if push % 2 else -1)
+        if abs(driven.x) > 0.1:
+            motor = int(math.copysign(motor, -driven.x))
+        for _ in range(dice.randint(1, 4)):
+            faults |= Fault(driven.ask(SetMotor(motor)).fault)
+    assert not faults & (Fault.CART_ENCODER | Fault.POLE_ENCODER)
+
+
+def test_short_pushes_within_a_coarse_count_are_no_frozen_cart() -> None:
+    coarse = FrozenCartWatch(hardware_of({"cart_nanometres_per_count": 500_000}))
+    motors = [200, 200, -200, -200] * 100  # 10 ms each way: 0.25 mm at 5 m/s^2
+    assert not any(coarse.frozen(7, motor, 5_000) for motor in motors)
+    motors = ([200] * 30 + [-200] * 30) * 2
+    assert [coarse.frozen(7, motor, 5_000) for motor in motors].index(True) == 30 + 26
+
+
+def test_a_coarse_pole_count_need_not_change_in_a_short_jerk() -> None:
+    coarse = FrozenPoleWatch(hardware_of({"pole_counts_per_turn": 360}))
+    jerks = itertools.accumulate([0, 0, 60, 0, -60] * 40)  # counts: 0.27 m/s for 5 ms
+    assert not any(coarse.frozen(5, cart, 5_000) for cart in jerks)
+    swings = itertools.accumulate(round(200 * math.sin(each / 20)) for each in range(1000))
+    assert any(coarse.frozen(5, cart, 5_000) for cart in swings)
 
 
 def test_a_rig_survives_json_and_leaves_a_chosen_track() -> None:
