@@ -21,7 +21,7 @@ from cartpole_rl.exporting.agent import read_agent
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.errors import fault_error
 from cartpole_rl.plants.settings import SerialSettings
-from cartpole_rl.rig.hardware import hardware_of, nominal_hardware
+from cartpole_rl.rig.hardware import hardware_of
 from cartpole_rl.signals import RaiseOnce, ending_signals
 from cartpole_rl.wire import Flags, seconds_between
 
@@ -81,6 +81,8 @@ def drive_armed(cart, agent, layers, pole_length, seconds):
     for _ in range(round(seconds / agent.control_period)):
         state = cart.get_state()
         check_cart(cart, state)
+        if last and (Flags.SOFT_LIMIT in cart.flags or not cart.took_motor(state)):
+            history[0]["motor"] = state.motor_applied  # the cart replaced or lost what was sent
         dt = seconds_between(last.time_us, state.time_us) if last else agent.control_period
         cart_step = state.cart_counts - last.cart_counts if last else 0
         pole_step = state.pole_counts - last.pole_counts if last else 0
@@ -119,13 +121,7 @@ def main(file, port, pole_length="0"):
     if agent.start == "upright":
         raise ConfigError("this agent needs an upright pole, and here it hangs; give an agent that swings up")
     length = length_of(pole_length, agent)
-    encoders = {
-        "cart_nanometres_per_count": round(1e9 * agent.cart_metres_per_count),
-        "pole_counts_per_turn": agent.pole_counts_per_turn,
-        "track_span": 2 * (agent.track_half_length + nominal_hardware().soft_limit),
-    }
-    # a cart with end switches also needs its left_switch and right_switch here
-    with SerialCart(SerialSettings(port=port), hardware_of(encoders)) as cart:
+    with SerialCart(SerialSettings(port=port), hardware_of(agent.hardware)) as cart:
         cart.home()
         cart.set_period(round(agent.control_period * 1e6))
         upright = drive(cart, agent, exported.layers, length, 10)

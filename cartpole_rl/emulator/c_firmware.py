@@ -38,6 +38,7 @@ RIG = {  # macros of cart_rig.h
     "CART_MOTOR_PER_NEWTON": "motor values per N beyond it",
     "CART_GENTLE_FORCE": "N, the largest of homing",
     "CART_SWITCHES": "end switches: 0 none, 1 left, 2 right, 3 both",
+    "CART_POLE_LEVER_UM": "um: m_p l / (m_c + m_p) of the pole, for the brake",
 }
 LONGEST_ANSWER = 70  # bytes: 2 * CART_FRAME_BYTES
 SNAPSHOT_NUMBERS = 96
@@ -197,8 +198,8 @@ def sources() -> list[Path]:
     return [*core, folder / "host" / "library.c"]
 
 
-def rig_macros(hardware: Hardware) -> dict[str, str | int]:
-    """Return the values of the macros in ``firmware/src/cart_rig.h`` for a rig."""
+def rig_macros(hardware: Hardware, lever: int = LEVER) -> dict[str, str | int]:
+    """Return the values of the macros in ``firmware/src/cart_rig.h`` for a rig, with a pole's lever in um."""
     values = (
         hardware.cart_nanometres_per_count,
         hardware.pole_counts_per_turn,
@@ -213,6 +214,7 @@ def rig_macros(hardware: Hardware) -> dict[str, str | int]:
         repr(hardware.motor_per_newton),
         repr(hardware.gentle_force),
         hardware.switches,
+        lever,
     )
     return dict(zip(RIG, values, strict=True))
 
@@ -222,14 +224,14 @@ def definitions(hardware: Hardware) -> tuple[str, ...]:
     return tuple(f"-D{name}={value}" for name, value in rig_macros(hardware).items())
 
 
-def rig_header(hardware: Hardware, source: str) -> str:
-    """Return the text of ``firmware/src/cart_rig.h`` for the rig of the cart `source`."""
+def rig_header(hardware: Hardware, source: str, lever: int = LEVER) -> str:
+    """Return the text of ``firmware/src/cart_rig.h`` for the rig and pole of `source`, with a lever in um."""
     macros = [
         f"#ifndef {name}\n#define {name} {value} /* {RIG[name]} */\n#endif\n"
-        for name, value in rig_macros(hardware).items()
+        for name, value in rig_macros(hardware, lever).items()
     ]
     about = (
-        f"/* Encoders, track and motor of cart={source}. cartpole-export format=firmware writes this file;\n"
+        f"/* Encoders, track, motor and pole of {source}. cartpole-export format=firmware writes this file;\n"
         "   flags -D override single numbers. No count is converted: the host needs the same numbers. */\n"
     )
     return f"{about}#ifndef CART_RIG_H\n#define CART_RIG_H\n\n{''.join(macros)}\n#endif\n"

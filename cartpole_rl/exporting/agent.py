@@ -77,6 +77,7 @@ class Description(Settings):
     control_period: Positive  # s
     cart_metres_per_count: Positive = nominal_encoders().metres
     pole_counts_per_turn: Count = nominal_encoders().turn
+    hardware: dict[str, Finite] = Field(default_factory=dict)  # the numbers of the rig in cart=
     pole_lengths: tuple[Positive, Positive]  # m, the shortest and the longest pole of the training
     provenance: dict[str, Any]  # of the training: command, versions, commit, seed, score
 
@@ -124,6 +125,7 @@ def description(
         control_period=settings.control_period,
         cart_metres_per_count=settings.hardware.encoders.metres,
         pole_counts_per_turn=settings.hardware.encoders.turn,
+        hardware=settings.hardware.model_dump(),
         pole_lengths=(min(lengths), max(lengths)),
         provenance=dict(provenance),
     )
@@ -199,8 +201,13 @@ class ExportedAgent:
     @property
     def identity(self) -> int:
         """The 32 bits that a board reports of its agent, never 0: such a checksum without the provenance."""
-        functional = self.description.model_dump(mode="json", exclude={"provenance"})
+        functional = self.description.model_dump(mode="json", exclude={"provenance", "hardware"})
         return int(self._digest(functional)[:8], 16) or 1
+
+    def identity_with(self, pole_length: float) -> int:
+        """Return what a board reports that was compiled for a pole of a length in m."""
+        centimetres = int(100 * pole_length + 0.5) if self.description.observation.pole_length else 0
+        return (self.identity ^ centimetres * 0x9E3779B1) & 0xFFFFFFFF or 1
 
     def _digest(self, description: dict[str, Any]) -> str:
         digest = hashlib.sha256(canonical_json(description).encode())

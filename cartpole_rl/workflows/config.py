@@ -363,6 +363,7 @@ class ExportConfig(Settings):
     run: Path | None = None
     source: Annotated[Path | None, Field(alias="from")] = None
     cart: dict[str, Finite] | None = None
+    pole: PoleSettings | None = None
     label: str
 
     @property
@@ -373,8 +374,8 @@ class ExportConfig(Settings):
     @model_validator(mode="after")
     def _an_agent_a_cart_or_recordings(self) -> Self:
         if self.of_recordings:
-            if self.run is not None or self.cart is not None:
-                raise ValueError(f"format={self.format} writes recordings; leave out run and cart")
+            if self.run is not None or self.cart is not None or self.pole is not None:
+                raise ValueError(f"format={self.format} writes recordings; leave out run, cart and pole")
             if self.source is None:
                 raise ValueError(f"from: format={self.format} needs from=<run folder of cartpole-record>")
             return self
@@ -384,8 +385,11 @@ class ExportConfig(Settings):
             if self.run is not None:
                 raise ValueError("run: format=firmware writes the numbers of a cart; leave it out")
             check_cart(self.cart or {})
-        elif self.cart is not None:
-            raise ValueError(f"cart: format={self.format} exports an agent with its own cart; leave it out")
+        elif self.cart is not None or self.pole is not None:
+            name = "pole" if self.cart is None else "cart"
+            raise ValueError(
+                f"{name}: format={self.format} exports an agent with its own {name}; leave it out"
+            )
         elif self.run is None:
             raise ValueError("run: give run=<run folder, checkpoint file or pretrained/medium>")
         return self

@@ -23,6 +23,7 @@ from cartpole_rl.evaluation.episodes import Knocks, Policy, run_batch, run_episo
 from cartpole_rl.evaluation.onboard import run_onboard_episodes
 from cartpole_rl.evaluation.recordings import read_origin
 from cartpole_rl.evaluation.snapshots import followed
+from cartpole_rl.exporting.agent import ExportedAgent
 from cartpole_rl.exporting.c_code import c_files
 from cartpole_rl.learning.states import seed_everything
 from cartpole_rl.randomization.poles import Pole, PoleSettings
@@ -74,7 +75,7 @@ class Evaluation:
     training: TrainConfig
     known_poles: Sequence[PoleSettings]  # of the agent
     simulation: CartPoleEnv | None  # that predicts the first episode
-    on_board: int | None  # identity of the agent that the cart's board should have; None if it does not drive
+    on_board: ExportedAgent | None  # that the cart's board should have; None if it does not drive
 
     def episodes(self) -> Iterator[Episode]:
         """Drive the repeated episode, or new ones, and yield each as it ends."""
@@ -98,7 +99,8 @@ class Evaluation:
     def check_board(self) -> None:
         """Raise PlantError if the cart's board shall drive and has no agent, or another one."""
         if self.on_board is not None:
-            self.env.plant.check_policy(self.on_board)
+            length = self.env.plant.pole_length.item() if self.settings.observation.pole_length else 0.0
+            self.env.plant.check_policy(self.on_board.identity_with(length))
 
     def onboard_episodes(self) -> Iterator[Episode]:
         """Let the policy on the cart's board drive, and yield each episode as it ends."""
@@ -142,7 +144,7 @@ def prepared(config: EvaluateConfig) -> Evaluation:
     )
     on_board = None
     if config.drives_on_board:
-        on_board = exported_agent(agent_on_board(config, agent, settings), {}).identity
+        on_board = exported_agent(agent_on_board(config, agent, settings), {})
     with on_the_board(config, agent, settings) as equipped:
         env = evaluated_env(settings, equipped, prompt=tqdm.write, confirm=confirm)
     return Evaluation(

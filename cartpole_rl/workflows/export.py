@@ -4,7 +4,9 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
+from cartpole_rl.choices import choice
 from cartpole_rl.emulator.c_firmware import rig_header
+from cartpole_rl.emulator.guards import lever_um
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.exchange import MinariData, write_mcap
 from cartpole_rl.evaluation.recordings import load_recording
@@ -13,8 +15,10 @@ from cartpole_rl.exporting.c_code import c_files
 from cartpole_rl.exporting.onnx_model import onnx_model
 from cartpole_rl.exporting.web_page import web_page
 from cartpole_rl.files import write_bytes, write_text
+from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.reporting.texts import count_text
 from cartpole_rl.rig.hardware import hardware_of
+from cartpole_rl.rig.parameters import completed
 from cartpole_rl.run_folder import recordings, write_config
 from cartpole_rl.terminal import shown
 from cartpole_rl.workflows.build import (
@@ -74,12 +78,22 @@ def write_recordings(config: ExportConfig, folder: Path) -> None:
 
 
 def write_rig(config: ExportConfig, folder: Path, words: Sequence[str]) -> None:
-    """Write cart_rig.h. Raises ConfigError for a folder that already holds a run."""
-    given = " ".join(word for word in words if word.startswith(("cart=", "cart.")))
-    header = rig_header(hardware_of(config.cart or {}), given.removeprefix("cart=") or "ip02")
+    """Write cart_rig.h. Raises ConfigError for a stepper, and for a folder that already holds a run."""
+    chosen = ("cart=", "cart.", "pole=", "pole.")
+    pole = config.pole or PoleSettings(**choice("pole/medium"))
+    given = [word for word in words if word.startswith(chosen)]
+    source = " ".join(given if config.cart else ["cart=ip02", *given])
+    numbers = completed({**(config.cart or {}), **pole.heaviest.model_dump()})
+    if numbers["backdrivability"] == 0:
+        raise ConfigError(
+            "cart: our firmware drives a DC motor, not a stepper; drive this cart with plant=text"
+        )
+    header = rig_header(hardware_of(config.cart or {}), source, lever_um(numbers))
     write_config(folder, "export", {**config.model_dump(mode="json"), "seed": None})
     write_text(folder / RIG_HEADER, header)
     print(f"{folder}/{RIG_HEADER} is written; build the firmware with RIG={(folder / RIG_HEADER).resolve()}")
+    if config.pole is None:
+        print("its brake allows for Quanser's medium pole; give pole= for another one")
 
 
 def files_of(form: str, agent: ExportedAgent, trained: TrainedAgent) -> dict[str, bytes]:

@@ -7,9 +7,6 @@
 #ifndef CART_PENDING
 #define CART_PENDING 1 /* motor values that can wait for their latency; a board applies them on arrival */
 #endif
-#ifndef CART_POLE_LEVER_UM
-#define CART_POLE_LEVER_UM 27000 /* um, m_p l / (m_c + m_p): Quanser's medium pole; 79000 for the large one */
-#endif
 
 /* From 2.0.0 on, protocol version 2. */
 #define CART_FIRMWARE_MAJOR 2

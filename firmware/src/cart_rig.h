@@ -1,4 +1,4 @@
-/* Encoders, track and motor of cart=ip02. cartpole-export format=firmware writes this file;
+/* Encoders, track, motor and pole of cart=ip02. cartpole-export format=firmware writes this file;
    flags -D override single numbers. No count is converted: the host needs the same numbers. */
 #ifndef CART_RIG_H
 #define CART_RIG_H
@@ -41,6 +41,9 @@
 #endif
 #ifndef CART_SWITCHES
 #define CART_SWITCHES 0 /* end switches: 0 none, 1 left, 2 right, 3 both */
+#endif
+#ifndef CART_POLE_LEVER_UM
+#define CART_POLE_LEVER_UM 27206 /* um: m_p l / (m_c + m_p) of the pole, for the brake */
 #endif
 
 #endif

@@ -37,10 +37,16 @@ COMPLAINS = {  # command: words, exit code, part of the line on stderr
         ("format=c", 2, "give run=<run folder"),
         ("format=mcap", 2, "format=mcap needs from=<run folder of cartpole-record>"),
         ("format=mcap from=nowhere", 2, "from=nowhere: there is no such file or folder"),
-        ("format=minari from=nowhere run=lqr", 2, "format=minari writes recordings; leave out run and cart"),
+        ("format=minari from=nowhere run=lqr", 2, "leave out run, cart and pole"),
         ("format=c from=nowhere run=lqr", 2, "from: format=minari or format=mcap exports recordings"),
         ("format=firmware run=pretrained/medium", 2, "run: format=firmware writes the numbers of a cart"),
         ("run=pretrained/medium format=c cart=ip02", 2, "format=c exports an agent with its own cart"),
+        ("run=pretrained/medium format=c pole=large", 2, "format=c exports an agent with its own pole"),
+        (
+            "format=firmware cart=stepper",
+            1,
+            "our firmware drives a DC motor, not a stepper; drive this cart with plant=text",
+        ),
     ],
     "distill": [
         ("run=nowhere", 1, "run=nowhere: there is no such file or folder"),

@@ -1,5 +1,6 @@
 """A cart with other encoders, another track and another motor, from its file alone."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -58,10 +59,15 @@ def test_its_firmware_has_its_numbers(folder: Path) -> None:
     assert "#define CART_NANOMETRES 40000 " in header
     assert "#define CART_POLE_COUNTS 2400 " in header
     assert "#define CART_SWITCHES 2 " in header
-    words = ("format=firmware", "cart=lab.yaml", "cart.track_span=0.5", "hydra.run.dir=longer")
-    assert in_process("export", *words, folder=folder).code == 0
-    header = (folder / "longer" / "cart_rig.h").read_text()
-    assert "of cart=lab.yaml cart.track_span=0.5." in header
+    assert "give pole= for another one" in done.out
+    words = ("format=firmware", "cart=lab.yaml", "cart.track_span=0.5", "pole=large", "hydra.run.dir=longer")
+    done = in_process("export", *words, folder=folder)
+    assert (done.code, "give pole=" in done.out) == (0, False)
+    longer = (folder / "longer" / "cart_rig.h").read_text()
+    assert "of cart=lab.yaml cart.track_span=0.5 pole=large." in longer
+    small, large = (int(re.findall(r"CART_POLE_LEVER_UM (\d+)", each)[0]) for each in (header, longer))
+    assert large == pytest.approx(small * (0.23 * 0.3302 / 0.127 / 0.1778), rel=0.2)
+    header = longer
     assert "#define CART_SPAN_UM 500000 " in header
 
 

@@ -109,5 +109,5 @@ def test_a_library_is_built_once_and_again_for_other_sources(tmp_path, monkeypat
 def test_the_shipped_header_is_that_of_ip02():
     """Write it again after a change: cartpole-export format=firmware cart=ip02."""
     shipped = (firmware_folder() / "src" / "cart_rig.h").read_text(encoding="utf-8")
-    assert shipped == rig_header(nominal_hardware(), "ip02")
+    assert shipped == rig_header(nominal_hardware(), "cart=ip02")
     assert [*c_firmware.RIG] == re.findall(r"#ifndef (?!CART_RIG_H)(\w+)", shipped)

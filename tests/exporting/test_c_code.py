@@ -16,6 +16,7 @@ import pytest
 import torch
 from parity import assert_same_actions
 
+from cartpole_rl.emulator.c_firmware import CFirmware
 from cartpole_rl.envs.build import simulated_env
 from cartpole_rl.evaluation.episodes import Policy, choose
 from cartpole_rl.exporting.agent import ExportedAgent, Floats
@@ -143,8 +144,17 @@ def test_so_they_are_for_every_observation_and_network(name: str, tmp_path: Path
     assert_figures(exported, compiled)
     if observes:
         assert_lengths(compiled, trained.training)
+        assert_identity_with_length(exported, tmp_path)
     if name == "plain":
         assert_overflow_is_no_action(exported, trained.training, tmp_path / "overflow")
+
+
+def assert_identity_with_length(exported: ExportedAgent, folder: Path) -> None:
+    """A board that was compiled for another length is told apart."""
+    boards = [CFirmware(lambda: 0, policy=folder, pole_length=length) for length in (0.3556, 0.66)]
+    reported = [board._head.policy_identity for board in boards]
+    assert reported == [exported.identity_with(0.3556), exported.identity_with(0.66)]
+    assert len({*reported, exported.identity}) == 3
 
 
 def assert_lengths(compiled: Compiled, training: TrainConfig) -> None:

@@ -194,8 +194,9 @@ class SerialCart:
             )
         if on_board != identity:
             raise PlantError(
-                f"the cart's board has another agent ({on_board:08x}, not {identity:08x}): export this one "
-                "with cartpole-export format=c and compile the firmware with it"
+                f"the cart's board has another agent ({on_board:08x}, not {identity:08x}), or one for a pole "
+                "of another length: export this one with cartpole-export format=c and compile the firmware "
+                "with it"
             )
 
     def start_policy(self) -> None:
@@ -235,9 +236,11 @@ class SerialCart:
 
         Returns the state after it; `information` then has the limits that follow from the measured span.
         `watch` is called with each state on the way.
-        Raises FaultError if homing fails, PlantError if it takes longer than `settings.home_timeout`,
-        LinkError if the cart restarts meanwhile.
+        Raises NotReadyError before the cart moves if it is not the one of its file. Raises FaultError if
+        homing fails, PlantError if it takes longer than `settings.home_timeout`, LinkError if the cart
+        restarts meanwhile.
         """
+        check_rig(self.information, self.flags, self.hardware)
         self._before_homing()
         with waiting("homing: the cart moves by itself, usually for 15 to 40 s", thread=False):
             return self._homed(watch)

@@ -322,7 +322,7 @@ def test_a_board_is_not_sent_beyond_its_track(position: float, monkeypatch: pyte
 
 
 def test_the_brake_knows_the_pole() -> None:
-    assert Playing()._stand_in._limits._lever == 27_000
+    assert Playing()._stand_in._limits._lever == LEVER
     large = {**choice("cart/ip02"), **choice("pole/large")["choices"]["large"]}
     assert lever_um(completed(large)) == pytest.approx(81_400, rel=0.01)
     assert lever_um({**completed(large), "backdrivability": 0.0}) == 0

@@ -269,7 +269,7 @@ def test_the_policy_on_the_board_has_to_be_the_agent_that_is_asked_for() -> None
         with SerialCart(quick_settings(peer.port)) as cart:
             cart.check_policy(0x1A2B3C4D)
             with pytest.raises(
-                PlantError, match=r"has another agent \(1a2b3c4d, not 00000005\): export this"
+                PlantError, match=r"has another agent \(1a2b3c4d, not 00000005\), or one for a pole"
             ):
                 cart.check_policy(5)
         assert not peer.flags & Flags.ARMED
