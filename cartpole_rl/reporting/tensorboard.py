@@ -31,6 +31,7 @@ from tensorboard.compat.proto.summary_pb2 import (
     DATA_CLASS_TENSOR,
     Summary,
 )
+from tensorboard.compat.tensorflow_stub.pywrap_tensorflow import masked_crc32c
 from torch.utils.tensorboard import FileWriter, summary
 
 from cartpole_rl.reporting.loggers import flatten
@@ -41,8 +42,7 @@ PLUGINS = {DATA_CLASS_SCALAR: "scalars", DATA_CLASS_TENSOR: "histograms", DATA_C
 FLUSH_SECONDS = 10  # largest age of what a running TensorBoard shows
 FIGURE_DPI = 110  # sharp on a page, and a third of the bytes of a saved figure
 
-HEADER = struct.Struct("<QI")
-FOOTER_BYTES = 4
+LENGTH, CRC = struct.Struct("<Q"), struct.Struct("<I")
 HPARAMS = "_hparams_/"  # prefix of the tags of TensorBoard's hparams plugin
 FINAL = "summary/"  # prefix of final metrics, one point each; TensorBoard shows them last
 OF_EPISODES = {
@@ -75,10 +75,10 @@ DESCRIPTIONS = {
     "speed/transitions_per_second": "Transitions a second, collecting, learning and evaluating included.",
     "pictures/behaviour": "Position, angle and motor value of the first episode of an evaluation.",
     "pictures/cart": "Animation of the first episode of an evaluation, in real time.",
-    "cart/score_before": "Score (6.2) of each episode on the cart before fine-tuning, without exploration.",
-    "cart/score_tune": "Score (6.2) of each episode that fine-tuning learns from, with random actions.",
-    "cart/score_after": "Score (6.2) of each episode on the cart after fine-tuning, without exploration.",
-    "cart/score_in_simulation": "Score (6.2) of the agent on simulated carts like this one.",
+    "cart/score_before": "Score of each episode on the cart before fine-tuning: (6.2), of a balance (6.1).",
+    "cart/score_tune": "Score of each episode that fine-tuning learns from, with random actions.",
+    "cart/score_after": "Score of each episode on the cart after fine-tuning: (6.2), of a balance (6.1).",
+    "cart/score_in_simulation": "Mean score of the agent on simulated carts drawn as in its training.",
     "link/frames_received": "Frames from the cart so far.",
     "link/bad_frames": "Damaged frames so far.",
     "link/lost_frames": "States that never arrived, so far.",
@@ -198,7 +198,7 @@ def cut_back(folder: Path, first_step: int) -> None:
     """Remove points at `first_step` and later, and the final results, from the event files in `folder`.
 
     The final results are the line on the HPARAMS page and the final metrics; a resumed run writes them again.
-    Other records stay, except a last one that a killed run left incomplete. Files are replaced atomically.
+    Other records stay, up to one that a killed run or a power cut damaged. Files are replaced atomically.
     """
     for path in sorted(folder.glob("events.out.tfevents.*")):
         copy = path.with_name(f"{path.name.replace('tfevents', 'rest')}.part")
@@ -222,14 +222,17 @@ def scalars(folder: Path, tag: str) -> list[tuple[int, float]]:
 
 
 def _records(source: BinaryIO) -> Iterator[tuple[bytes, Event]]:
-    """Yield each complete record with its event."""
-    while len(header := source.read(HEADER.size)) == HEADER.size:
-        length, _ = HEADER.unpack(header)
-        body = source.read(length)
-        footer = source.read(FOOTER_BYTES)
-        if len(body) < length or len(footer) < FOOTER_BYTES:
+    """Yield the records before the first one that is incomplete or damaged, each with its event."""
+    while _is_whole(length := source.read(LENGTH.size), mark := source.read(CRC.size)):
+        body, footer = source.read(*LENGTH.unpack(length)), source.read(CRC.size)
+        if not _is_whole(body, footer):
             return
-        yield header + body + footer, Event.FromString(body)
+        yield length + mark + body + footer, Event.FromString(body)
+
+
+def _is_whole(content: bytes, crc: bytes) -> bool:
+    """Return True if `crc` is the CRC of `content`."""
+    return crc == CRC.pack(masked_crc32c(content))
 
 
 def _is_kept(event: Event, first_step: int) -> bool:

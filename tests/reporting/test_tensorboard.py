@@ -132,6 +132,18 @@ class TestResume:
             log.scalars({"a": 3.0}, 2)
         assert points(tmp_path, "a") == {1: 1.0, 2: 3.0}
 
+    @pytest.mark.parametrize("zeroed", [5, 20, 40])
+    def test_what_a_power_cut_zeroed_is_dropped(self, zeroed: int, tmp_path: Path) -> None:
+        with TensorBoardLog(tmp_path) as log:
+            log.scalars({"a": 1.0}, 1)
+            log.scalars({"a": 2.0}, 2)
+        (path,) = tmp_path.iterdir()
+        path.write_bytes(path.read_bytes()[:-zeroed] + bytes(zeroed + 4000))
+        assert scalars(tmp_path, "a") == [(1, 1.0)]
+        with TensorBoardLog(tmp_path, purge_step=2) as log:
+            log.scalars({"a": 3.0}, 2)
+        assert points(tmp_path, "a") == {1: 1.0, 2: 3.0}
+
     def test_resuming_into_an_empty_folder_starts_a_new_log(self, tmp_path: Path) -> None:
         with TensorBoardLog(tmp_path / "new", purge_step=5) as log:
             log.scalars({"a": 1.0}, 5)
