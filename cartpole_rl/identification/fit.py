@@ -13,8 +13,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from cartpole_rl.errors import RecordingError
 from cartpole_rl.identification.matching import (
     COARSE,
+    NO_CART,
     ROBUST,
     Match,
     Matching,
@@ -45,6 +47,7 @@ STARTS: tuple[Mapping[str, float], ...] = (  # points to search from; an unknown
     {"latency": -0.7, "motor_time_constant": 1.5},
 )
 SCREENING = 4  # iterations from each start
+HOPELESS = np.array([1.0, math.pi])  # m, rad: RMS errors of no cart
 
 
 @dataclass(frozen=True)
@@ -81,9 +84,14 @@ def best_fit(
     period: float,
     substeps: int = 4,
 ) -> tuple[Fit, Models]:
-    """Return the fit with the lowest cost among those under each of the `candidates`, and its models."""
+    """Return the fit with the lowest cost among those under each of the `candidates`, and its models.
+
+    Raises RecordingError for windows in which no cart moves.
+    """
     fits = [(fit_cart(windows, nominal, models, period, substeps), models) for models in candidates]
     fit, chosen = min(fits, key=lambda each: each[0].cost)
+    if (fit.rms > HOPELESS).any():
+        raise RecordingError(NO_CART)
     return replace(fit, covariance=within_prior(fit.covariance)), chosen
 
 

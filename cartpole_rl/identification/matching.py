@@ -37,6 +37,10 @@ FACTORS = (0.1, 1.0, 10.0)  # of the dampings that are tried side by side
 ATTEMPTS = 3  # to lower the cost from one linearization, with a hundred times the damping each
 CONVERGED = 1e-4  # relative fall of the cost
 SETTLED = 0.3  # standard deviations: the last step of a point; outliers' initial states may still move
+NO_CART = (
+    "no cart moves as the recordings say, their counts jump: check the encoders and their cables, and record "
+    "again, or leave these recordings out"
+)
 ROUNDS = 10  # steps from a first guess of the initial states
 
 
@@ -46,10 +50,7 @@ def solvable() -> Iterator[None]:
     try:
         yield
     except (np.linalg.LinAlgError, torch.linalg.LinAlgError):
-        raise RecordingError(
-            "no cart moves as the recordings say, their counts jump: check the encoders and their cables, "
-            "and record again, or leave these recordings out"
-        ) from None
+        raise RecordingError(NO_CART) from None
 
 
 def huber(residuals: Tensor) -> Tensor:

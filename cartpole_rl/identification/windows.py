@@ -88,6 +88,8 @@ def cut_windows(
         if apart_from is None or not apart_from.share_frames(piece)
     ]
     if not pieces:
+        if all(episode.measured_steps < periods for episode in episodes):
+            raise RecordingError(f"no recording lasts {periods * period:g} s: record longer")
         raise RecordingError(
             f"no recording holds {periods * period:g} s without a lost frame: record longer, check the cable"
         )
@@ -138,6 +140,8 @@ def _pieces(
 ) -> Iterator[Windows]:
     """Yield single windows of `length` periods, every `step`, whose history and first `least` are known."""
     history, end = history_periods(period), episode.measured_steps
+    if end < least:  # the median of a few gaps tells no period
+        return
     late = np.flatnonzero(~regular_frames(episode, period)[:end])
     last_known = np.append(late, end)  # rows after which the motion is not known
     before = np.zeros(history)

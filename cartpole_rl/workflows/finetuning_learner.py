@@ -101,7 +101,7 @@ class CartLearner:
     """
 
     loop: Finetuning
-    carts: torch.Tensor  # [P, SAMPLES], drawn from the newest fit
+    carts: torch.Tensor  # [P, SAMPLES], drawn from the newest fit, or as in training
     recorded: list[Episode]  # evaluations first
 
     def __init__(
@@ -122,11 +122,16 @@ class CartLearner:
     def start(self, recorded: Sequence[Episode], learned: int = 0) -> Scalars:
         """Fit the simulator to the `recorded` episodes and prepare learning; return the first curves.
 
-        The agent has learned from `learned` episodes already: the schedules continue there. Raises
-        RecordingError.
+        The agent has learned from `learned` episodes already: the schedules continue there. Where no cart can
+        be fitted yet, as to episodes that are too short, carts are drawn as in training.
         """
-        fit, models = self.fit_simulator(recorded)
-        self.carts = self.draw_carts(fit)
+        try:
+            fit, models = self.fit_simulator(recorded)
+            self.carts = self.draw_carts(fit)
+        except RecordingError as error:
+            self.show(f"the simulator is not fitted yet, its carts are drawn as in training: {error}")
+            models, random = self.candidates[0], torch.Generator().manual_seed(self.config.seed)
+            self.carts = randomizer(self.training).draw(SAMPLES, random)
         self.prepare(recorded, models)
         self.loop.iteration = learned * self.config.finetuning.iterations
         self.loop.fill()

@@ -181,8 +181,14 @@ class TestWindows:
         assert cut_windows([broken], PERIOD).number < whole.number
 
     def test_too_short_recordings_are_refused(self, episodes: list[Episode]) -> None:
-        with pytest.raises(RecordingError, match="record longer"):
+        with pytest.raises(RecordingError, match=r"no recording lasts 12 s: record longer$"):
             cut_windows(episodes, PERIOD, seconds=12.0)
+
+    def test_the_period_of_one_that_holds_no_window_is_not_judged(self, episodes: list[Episode]) -> None:
+        late = episodes[0].first(3)
+        late = Episode(**{**vars(late), "time": 2 * late.time})
+        windows = cut_windows([late, episodes[0]], PERIOD)
+        assert windows.number == cut_windows(episodes[:1], PERIOD).number
 
     def test_their_length_is_in_seconds(
         self, make_plant: MakePlant, make_environment: MakeEnvironment, nominal: dict[str, float]
