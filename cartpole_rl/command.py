@@ -29,6 +29,7 @@ from cartpole_rl.composition import as_mapping, hydra_overrides, is_completing, 
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.exits import (
     EXPECTED,
+    FAILED,
     Terminated,
     catch_signals,
     exit_after_signal,
@@ -99,11 +100,12 @@ def run_job(
     with job_signals():
         try:
             return run_as_job(name, folder, work) if is_job() else work()
-        except EXPECTED as error:
-            exit_with_message(name, error)
-        except (KeyboardInterrupt, Terminated) as signalled:
-            if (folder / CHECKPOINTS / RESUME).exists():
-                signalled.add_note(use_of(folder, name))
+        except (*EXPECTED, KeyboardInterrupt, Terminated) as ended:
+            interrupted = isinstance(ended, (*FAILED, KeyboardInterrupt, Terminated))
+            if interrupted and (folder / CHECKPOINTS / RESUME).exists():
+                ended.add_note(use_of(folder, name))
+            if isinstance(ended, EXPECTED):
+                exit_with_message(name, ended)
             raise
         finally:
             remove_if_empty(folder, name)

@@ -51,17 +51,19 @@ from cartpole_rl.choices import (
     is_shipped,
     load,
     merged,
+    read_file,
 )
 from cartpole_rl.errors import ConfigError, reason_of
 from cartpole_rl.rig.hardware import HARDWARE, hardware_of
 from cartpole_rl.rig.parameters import PARAMETERS, check_value, completed
-from cartpole_rl.run_folder import PREFIX, RUN_FILES, USES, check_program, program_of, use_of
+from cartpole_rl.run_folder import CONFIG, PREFIX, RUN_FILES, USES, check_program, program_of, use_of
 from cartpole_rl.terminal import in_quotes
 
 WORD = re.compile(r"([a-z_]+)=(.+)", re.DOTALL)
 NAME = re.compile(r"(?!(?:null|true|false|nan|inf)$)[a-z_][\w-]*", re.IGNORECASE | re.ASCII)
 OWN = "own"  # the group of what a user's own choices give: own/cart, own/pole, ...
 KEPT = "emulator.given="
+RESUMED = ("plant", "learner")  # groups of which a resumed run takes single settings
 FRICTIONS = ("cart_friction", "pole_friction")  # groups whose `parameters` replace numbers of `cart`
 ONE_OF = {  # settings of a group, or of each of its parameters, of which one is given
     "pole": ("choices", "lengths"),
@@ -201,7 +203,7 @@ class _OwnChoices:
         keys = {key_of(word) for word in words}
         frictions = [group for group in FRICTIONS if self.groups.get(group) is not None or group in keys]
         groups = sorted(self.given.keys() - {"sweep"}, key=lambda group: (group in WHOLE, group in FRICTIONS))
-        more = []
+        more = self._resumed(words)
         for group in groups:
             others = {*self.names[group], *self._found(group), self.groups.get(group) or ""}
             for name in others | {*self.given[group]}:
@@ -228,6 +230,18 @@ class _OwnChoices:
             more.append(f"{KEPT}[{','.join(kept)}]")
         place = next((number for number, word in enumerate(words) if key_of(word)), 0)
         return [*words[:place], *more, *words[place:]]
+
+    def _resumed(self, words: Sequence[str]) -> list[str]:
+        """Return what gives a resumed run's own choices of the groups of which single settings are given."""
+        given = {key_of(word): word for word in words}
+        groups = {key.partition(".")[0] for key in given if "." in key}.intersection(RESUMED) - given.keys()
+        runs = _elements(given["resume"], "") if groups and "resume" in given else None
+        if runs is None or len(runs) > 1 or runs[0] is None:
+            return []
+        run = runs[0].text if isinstance(runs[0], QuotedString) else _text(runs[0])
+        recorded = read_file("resume", Path(run) / CONFIG)
+        self._put(f"{OWN}/resumed", "resumed", {group: recorded.get(group) for group in groups}, "_global_")
+        return [f"+{OWN}/resumed=resumed"]
 
     def _kept_by_emulator(self, keys: Iterable[str]) -> list[str]:
         """Return the settings of the emulator that the user gave, which no cart's file replaces."""

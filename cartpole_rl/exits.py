@@ -17,13 +17,14 @@ from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
 from cartpole_rl.composition import error_message
-from cartpole_rl.errors import CartPoleError, ConfigError, reason_of
+from cartpole_rl.errors import CartPoleError, ConfigError, LearnerError, PlantError, reason_of
 from cartpole_rl.files import FULL
 from cartpole_rl.signals import RaiseOnce, ending_signals
 from cartpole_rl.terminal import exit_if_nobody_reads, print_message
 
 SIGNALLED = 128  # added to the number of a signal, as a shell does
 OF_HYDRA = (HydraException, OmegaConfBaseException)  # some of which are OSErrors too
+FAILED = (PlantError, LearnerError, OSError)  # what may work at another time, with the same settings
 EXPECTED = (CartPoleError, *OF_HYDRA, OSError)  # printed without a traceback
 UNNAMED = {*FULL, errno.EFBIG, errno.EIO}  # of writing, which names no file
 
@@ -37,7 +38,7 @@ class Terminated(BaseException):
 
 
 def exit_with_message(name: str, error: Exception, plants: Collection[str] = ()) -> NoReturn:
-    """Print an error and exit; `plants` are those that the command takes.
+    """Print an error and its notes, and exit; `plants` are those that the command takes.
 
     Raises an OSError that concerns no file: it is a defect of this package.
     """
@@ -50,7 +51,7 @@ def exit_with_message(name: str, error: Exception, plants: Collection[str] = ())
         code = ConfigError.exit_code
     elif isinstance(error, OSError) and not error.filename and error.errno not in UNNAMED:
         raise error
-    print_message(name, one_line(error, name, plants))
+    print_message(name, "; ".join([one_line(error, name, plants), *getattr(error, "__notes__", ())]))
     sys.exit(code)
 
 

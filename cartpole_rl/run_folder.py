@@ -63,7 +63,11 @@ PACKAGES = ("cartpole_rl", "torch", "torchrl", "tensordict", "numpy", "hydra-cor
 
 
 def write_config(
-    folder: Path, program: str, config: Mapping[str, Any], resumed: bool = False, agent: Path | None = None
+    folder: Path,
+    program: str,
+    config: Mapping[str, Any],
+    resumed: bool = False,
+    agent: Path | bytes | None = None,
 ) -> None:
     """Write config.yaml and provenance.json of a run of cartpole-<program>, which starts from `agent`.
 
@@ -85,9 +89,9 @@ def write_config(
     write_json(folder / PROVENANCE, {**head, **provenance()})
 
 
-def file_hash(file: Path) -> str:
-    """Return the SHA-256 of a file."""
-    return hashlib.sha256(file.read_bytes()).hexdigest()
+def file_hash(file: Path | bytes) -> str:
+    """Return the SHA-256 of a file, or of its content."""
+    return hashlib.sha256(file if isinstance(file, bytes) else file.read_bytes()).hexdigest()
 
 
 def program_of(folder: Path) -> str | None:

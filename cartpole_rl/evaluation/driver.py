@@ -137,7 +137,7 @@ def _alive() -> Iterator[None]:
     try:
         yield
     except (EOFError, ConnectionError):
-        raise LinkError("the process that drives the cart has died; start again with resume=") from None
+        raise LinkError("the process that drives the cart has died") from None
 
 
 class _Ended(BaseException):

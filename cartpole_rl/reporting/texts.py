@@ -111,7 +111,7 @@ def guard_text(*episodes: Episode) -> str:
 
 
 def cut_off(episodes: Sequence[Episode]) -> Iterator[str]:
-    """Yield a warning for each fault that ended episodes early; their scores count in the means."""
+    """Yield a warning for each fault that ended some of the episodes early."""
     for ending in (Ending.LINK, Ending.FAULT, Ending.NON_FINITE):
         if count := sum(episode.ended_by == ending for episode in episodes):
             yield f"warning: {count} of {count_text(len(episodes))} ended early by {ending} (docs/safety.md)"

@@ -70,6 +70,15 @@ EXTRAS = {"onnx": "export", "minari": "minari", "mcap": "mcap"}  # of formats
 SIMILAR_MASS = 0.2  # share by which an emulated pole may differ from the stated one
 MINARI_FILE = "main_data.hdf5"
 TAKEN_BY_REPEAT = ("run", "repeat.run", "repeat.episode", "label", "view")
+# by a fine-tuning: where its learner is, how its cart is reached
+TAKEN_BY_RESUME = (
+    "resume",
+    "learner",
+    "view",
+    "plant.port",
+    "plant.clear_faults",
+    "plant.home_timeout",
+)
 
 
 def check_training(config: TrainConfig, folder: Path, words: Sequence[str]) -> None:
@@ -117,7 +126,7 @@ def check_tuning(config: FinetuneConfig, folder: Path, words: Sequence[str]) -> 
     if config.resume is None:
         check_finetuning(config)
     else:
-        refuse_others(words, ("resume", "learner"), "resume uses that run's own config")
+        refuse_others(words, TAKEN_BY_RESUME, "resume uses that run's own config")
         check_resumable("finetune", config.resume, folder)
 
 
@@ -125,12 +134,17 @@ def check_finetuning(config: FinetuneConfig) -> Path:
     """Return the run to fine-tune. Raises CartPoleError if it has no agent."""
     if config.run is None:
         raise ConfigError(f"{missing('run')}, or resume=runs/finetune/<run> to continue a fine-tuning")
+    check_agent(config.run)
+    check_tools(config)
+    return config.run
+
+
+def check_tools(config: FinetuneConfig) -> None:
+    """Raise ConfigError if what a fine-tuning compiles or learns with is not installed."""
     if config.compile:
         check_compiler()
-    check_agent(config.run)
     if config.learner.kind == "ray":
         check_installed("learner=ray", "ray", where=", on both machines")
-    return config.run
 
 
 def check_distillation(config: DistillConfig) -> None:

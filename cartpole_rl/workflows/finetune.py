@@ -7,10 +7,11 @@ disk before the next one starts: an interruption costs at most the current one.
 
 import secrets
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from torch import nn
 
@@ -30,6 +31,7 @@ from cartpole_rl.learning.checkpoints import (
     load_training,
     save_agent,
 )
+from cartpole_rl.learning.dqn import Training
 from cartpole_rl.learning.settings import RayLearnerSettings
 from cartpole_rl.learning.states import seed_everything
 from cartpole_rl.plants.serial.preparation import Confirm
@@ -70,7 +72,7 @@ from cartpole_rl.workflows.build import (
     trained_agent,
     use_threads,
 )
-from cartpole_rl.workflows.checks import check_finetuning, check_resumable, is_given
+from cartpole_rl.workflows.checks import check_finetuning, check_resumable, check_tools
 from cartpole_rl.workflows.config import EvaluateConfig, FinetuneConfig, TrainConfig, recorded_settings
 from cartpole_rl.workflows.finetuning_cart import FinetuningCart, FinetuningFiles, Stage, yielding_to
 from cartpole_rl.workflows.finetuning_learner import CartLearner, TunedAgent, check_simulation
@@ -88,22 +90,25 @@ show = partial(print_message, "finetune")
 def finetune(config: FinetuneConfig, folder: Path, words: Sequence[str] = ()) -> None:
     """Fine-tune the agent of `config.run` on the cart of `config.plant`, or resume the run in `folder`.
 
-    A resumed run uses its own settings and the agent that it started from; where the
-    `words` of the command line choose a learner, `config.learner` replaces its learner.
+    A resumed run uses its own settings and the agent that it started from, and of `config` what the `words`
+    of the command line give.
 
     Writes config.yaml, provenance.json, recordings/, TensorBoard events, comparison.json (before and after),
-    metrics.json, figures/ and checkpoints/last.pt with the better of both policies; until the end also
-    checkpoints/start.pt and resume.pt. Prints both scores. Raises ConfigError and CheckpointError before the
-    cart moves, PlantError and LinkError for a cart that fails, LearningError if learning diverges.
+    metrics.json, figures/, checkpoints/last.pt with the better of both policies, and before.pt or after.pt
+    with the other one; until the end also checkpoints/start.pt and resume.pt. Prints both scores. Raises
+    ConfigError, CheckpointError and RecordingError before the cart moves, PlantError and LinkError for a cart
+    that fails, LearningError if learning diverges.
     """
     checkpoint = None
     if config.resume is not None:
         check_resumable("finetune", config.resume, folder)
         checkpoint = load_training(Path(config.resume), FINETUNING_FORMAT)
-        learner = {"learner": config.learner.model_dump()} if is_given(("learner",), words) else {}
-        values = {**checkpoint.config, "resume": config.resume, **learner}
+        values = overlaid(checkpoint.config, config.model_dump(mode="json"), words)
         config = recorded_settings(FinetuneConfig, values, f"resume={config.resume}")
+        check_tools(config)
     files = FinetuningFiles(folder, config)
+    if checkpoint:
+        files.check(checkpoint.step)
     run = started_from(files) if checkpoint else check_finetuning(config)
     use_threads(config.threads)
     seed_everything(config.seed)
@@ -111,6 +116,11 @@ def finetune(config: FinetuneConfig, folder: Path, words: Sequence[str] = ()) ->
     training, kind = agent.training, agent.training.agent.kind
     if not (isinstance(kind.item, type) and issubclass(kind.item, QAgent)):
         raise ConfigError(f"run={run}: fine-tuning trains Q-networks, this is an agent of agent.kind={kind}")
+    if kind.learner.item is not Training:
+        raise ConfigError(
+            f"run={run}: fine-tuning has a learner of its own, and so has agent.kind={kind}; give an agent "
+            "that learning.dqn.Training trained"
+        )
     evaluation = evaluation_config(config)
     settings = evaluated_settings(training, evaluation)
     emulated = config.plant.reads_emulator
@@ -120,14 +130,14 @@ def finetune(config: FinetuneConfig, folder: Path, words: Sequence[str] = ()) ->
     if not isinstance(config.learner, RayLearnerSettings):  # whose machine has the files
         check_simulation(training)
     with claimed(folder):
-        start = find_agent(run)
+        start = find_agent(run).read_bytes()  # once: its training may go on
         content = config.model_dump(mode="json")
         write_config(folder, "finetune", content, resumed=checkpoint is not None, agent=start)
         if run != files.start:
-            write_bytes(files.start, start.read_bytes())
+            write_bytes(files.start, start)
         if not checkpoint:
             files.save({}, 0)
-        drive_all(files, TunedAgent(training, load_agent(start), checkpoint), settings, evaluation)
+        drive_all(files, TunedAgent(training, load_agent(files.start), checkpoint), settings, evaluation)
         forget_training(folder)
         files.start.unlink(missing_ok=True)
 
@@ -148,7 +158,7 @@ def drive_all(
         Driver(make_env, make_policy, real_time, confirm) as driver,
         yielding_to(driver, link is None) if real_time else nullcontext(),
     ):
-        cart = FinetuningCart(driver, files, log)
+        cart = FinetuningCart(driver, files, log, settings.task.measure)
         cart.evaluate(Stage.BEFORE, tuned.first_weights)
         if link is None:
             learn_here(cart, tuned, settings)
@@ -156,6 +166,21 @@ def drive_all(
             learn_there(link, cart, tuned)
         cart.evaluate(Stage.AFTER, tuned.weights)
         compare(cart, tuned, settings)
+
+
+def overlaid(recorded: Mapping[str, Any], given: Mapping[str, Any], words: Sequence[str]) -> dict[str, Any]:
+    """Return the `recorded` settings of a run with those `given` that the `words` of a command line name.
+
+    A learner of the same kind keeps its other settings.
+    """
+    values = {**recorded, "resume": given["resume"]}
+    for word in words:
+        group, _, name = word.lstrip("+~").partition("=")[0].partition(".")
+        if name:
+            values[group] = {**values[group], name: given[group][name]}
+        elif word != f"learner={values.get('learner', {}).get('kind')}":
+            values[group] = given[group]
+    return values
 
 
 def started_from(files: FinetuningFiles) -> Path:
@@ -301,25 +326,31 @@ def save_newest(files: FinetuningFiles, tuned: TunedAgent) -> None:
 
 
 def compare(cart: FinetuningCart, tuned: TunedAgent, settings: CartPoleSettings) -> None:
-    """Keep the better policy, and write and print the results."""
+    """Keep the better policy, and write both and the results, and print these."""
     files, config, task = cart.files, cart.config, settings.task
-    episodes = {stage: files.episodes(stage) for stage in (Stage.BEFORE, Stage.AFTER)}
+    episodes = {stage: files.episodes(stage) for stage in Stage}
     summaries = {}
-    for stage, driven in episodes.items():
-        summary, listed = summarized(driven, task.x_max)
+    for stage in (Stage.BEFORE, Stage.AFTER):
+        summary, listed = summarized(episodes[stage], task.x_max)
         summaries[stage] = {**summary, "episodes": listed}
     scores = {stage: each[task.measure]["mean"] for stage, each in summaries.items()}
     kept = Stage.AFTER if scores[Stage.AFTER] >= scores[Stage.BEFORE] else Stage.BEFORE
     folder, link = files.folder, cart.link_summary()
-    save_agent(folder / CHECKPOINTS / LAST, tuned.checkpoint(kept, scores[kept], settings.pole))
+    other = Stage.BEFORE if kept is Stage.AFTER else Stage.AFTER
+    names = {other: f"{other}.pt", kept: LAST}
+    for stage, name in names.items():
+        save_agent(folder / CHECKPOINTS / name, tuned.checkpoint(stage, scores[stage], settings.pole))
     report_episodes(folder, episodes[kept], config.plant.kind, settings.pole, task, link)
     write_json(folder / COMPARISON, {**summaries, "kept": kept})
     for stage, summary in summaries.items():
         print(score_table(summary, f"{stage}, {count_text(len(episodes[stage]))}"))
-    for line in cut_off([*episodes[Stage.BEFORE], *episodes[Stage.AFTER]]):
+    for line in cut_off([episode for driven in episodes.values() for episode in driven]):
         print(line)
     print_loop_time(link.get("latency_override"))
-    print(f"kept: the policy {kept} fine-tuning, by its {SCORES[task.measure]}")
+    print(
+        f"kept: the policy {kept} fine-tuning, by its {SCORES[task.measure]}; the other one is "
+        f"{CHECKPOINTS}/{names[other]}"
+    )
     written = f"{METRICS}, {COMPARISON}, {CHECKPOINTS}/{LAST} and {RECORDINGS}/"
     words = plant_words(config.plant, config.emulator)
     print_results(folder, written, f"cartpole-evaluate {as_word('run', shown(folder))} {words}")

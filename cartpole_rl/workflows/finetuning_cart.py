@@ -12,7 +12,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from cartpole_rl.errors import LearningError, LinkError
+from cartpole_rl.errors import LearningError, LinkError, RecordingError
 from cartpole_rl.evaluation.driver import Driver, EpisodeRequest
 from cartpole_rl.evaluation.driving_policy import Weights
 from cartpole_rl.evaluation.recordings import LENGTH, read_recording, write_recording
@@ -23,10 +23,12 @@ from cartpole_rl.reporting.texts import ending_text, guard_text
 from cartpole_rl.run_folder import CHECKPOINTS, RECORDINGS, START
 from cartpole_rl.scheduling import giving_precedence
 from cartpole_rl.tasks.episode import Ending, Episode
-from cartpole_rl.terminal import print_message
+from cartpole_rl.tasks.settings import Measure
+from cartpole_rl.terminal import as_word, print_message
 from cartpole_rl.workflows.config import FinetuneConfig
 
-LARGEST_LOSSES = 3  # of the link in succession, in an evaluation
+LARGEST_LOSSES = 3  # in succession, of episodes that do not count
+SHORTEST = 1.0  # s of an episode to learn from that the link ended
 
 
 class Stage(StrEnum):
@@ -60,6 +62,20 @@ class FinetuningFiles:
         """Read an episode. Raises RecordingError."""
         return read_recording(self.path(stage, number))
 
+    def check(self, learned: int) -> None:
+        """Raise RecordingError if an episode is missing before a recorded one, or one of the `learned`."""
+        evaluations, episodes = self.config.evaluation_episodes, self.config.episodes
+        numbers = {Stage.BEFORE: evaluations, Stage.TUNE: episodes, Stage.AFTER: evaluations}
+        paths = [self.path(stage, number) for stage, count in numbers.items() for number in range(count)]
+        missing = next((place for place, path in enumerate(paths) if not path.exists()), len(paths))
+        if learned and missing < evaluations + learned:
+            remedy = f"put it back, or start anew: cartpole-finetune {as_word('run', self.config.run)}"
+        elif any(path.exists() for path in paths[missing:]):
+            remedy = "put it back, or move the later ones away: they are driven again"
+        else:
+            return
+        raise RecordingError(f"resume={self.folder}: {RECORDINGS}/{paths[missing].name} is missing; {remedy}")
+
     def episodes(self, stage: Stage) -> list[Episode]:
         """Read all recorded episodes of a stage, in order. Raises RecordingError."""
         return [self.episode(stage, number) for number in range(self.count(stage))]
@@ -88,10 +104,10 @@ def pole_length(config: FinetuneConfig) -> float | None:
 
 
 class FinetuningCart:
-    """Drives episodes with `driver`, writes them to `files` and logs them to `log`."""
+    """Drives episodes with `driver`, writes them to `files` and logs them, scored by `measure`, to `log`."""
 
-    def __init__(self, driver: Driver, files: FinetuningFiles, log: TensorBoardLog) -> None:
-        self.driver, self.files, self.log = driver, files, log
+    def __init__(self, driver: Driver, files: FinetuningFiles, log: TensorBoardLog, measure: Measure) -> None:
+        self.driver, self.files, self.log, self.measure = driver, files, log, measure
         self.config = files.config
         self.link: LinkStatistics | None = None  # since the driver started; None before its first episode
 
@@ -116,9 +132,9 @@ class FinetuningCart:
     def finish(self, stage: Stage, number: int) -> None:
         """Wait for the started episode, write and log it.
 
-        An episode without a control period is driven again; so is an evaluation that the link ended, since it
-        says nothing about the agent. Raises LinkError if that happens LARGEST_LOSSES times in succession, and
-        LearningError if the network's numbers were not finite: the cart was stopped.
+        An episode that does not count is driven again (`counts`). Raises LinkError if that happens
+        LARGEST_LOSSES times in succession, and LearningError if the network's numbers were not finite: the
+        cart was stopped.
         """
         for losses in range(1, LARGEST_LOSSES + 1):
             driven = self.driver.result()
@@ -128,7 +144,7 @@ class FinetuningCart:
                     f"{stage} {number + 1}: an observation or an action value was not finite, so the cart "
                     "was stopped; nothing is learned from this episode"
                 )
-            if episode.steps and (stage is Stage.TUNE or episode.ended_by != Ending.LINK):
+            if counts(stage, episode):
                 self.keep(stage, number, episode, driven.link)
                 return
             lost = f"{stage} {number + 1}: {ending_text(episode)}"
@@ -140,7 +156,7 @@ class FinetuningCart:
     def keep(self, stage: Stage, number: int, episode: Episode, link: LinkStatistics) -> None:
         """Write and log an episode."""
         self.files.write_episode(stage, number, episode)
-        score, step = float(episode.score.sum()), self.step(stage, number + 1)
+        score, step = episode.total(self.measure), self.step(stage, number + 1)
         share = None if episode.guarded is None else float(episode.guarded.mean())
         self.log.scalars({f"cart/score_{stage}": score, f"cart/guarded_{stage}": share}, step)
         self.log.scalars({f"link/{key}": float(value) for key, value in vars(link.summary()).items()}, step)
@@ -163,6 +179,18 @@ class FinetuningCart:
         if self.link is None:
             return {}
         return {**vars(self.link.summary()), "latency_override": self.link.latency_override()}
+
+
+def counts(stage: Stage, episode: Episode) -> bool:
+    """Return whether an episode is kept: one without a control period is not.
+
+    Nor is an evaluation that the link or an encoder ended, which says nothing about the agent, or an episode
+    to learn from that the link ended at once.
+    """
+    if stage is Stage.TUNE and episode.ended_by == Ending.LINK:
+        return bool(episode.time[-1] - episode.time[0] >= SHORTEST)
+    broken = stage is not Stage.TUNE and (episode.ended_by == Ending.LINK or episode.left_out)
+    return bool(episode.steps and not broken)
 
 
 @contextmanager

@@ -13,6 +13,7 @@ import pytest
 from command_line import FINETUNING, Outcome, console_script, in_process, interrupt_after, outcome
 from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
 
+from cartpole_rl.errors import PortError
 from cartpole_rl.evaluation.recordings import read_recording
 from cartpole_rl.learning.checkpoints import (
     FINETUNING_FORMAT,
@@ -22,7 +23,10 @@ from cartpole_rl.learning.checkpoints import (
     save_agent,
     save_training,
 )
+from cartpole_rl.run_folder import write_config
 from cartpole_rl.workflows.build import trained_agent
+from cartpole_rl.workflows.config import FinetuneConfig, load_settings
+from cartpole_rl.workflows.finetuning_cart import FinetuningFiles
 
 
 def test_every_episode_is_on_disk_once(tuned: tuple[Path, Outcome]) -> None:
@@ -38,6 +42,9 @@ def test_the_better_policy_is_kept_and_reported(tuned: tuple[Path, Outcome]) -> 
     better = "after" if after >= before else "before"
     assert compared["kept"] == better
     assert f"kept: the policy {better} fine-tuning" in done.out
+    other = "before" if better == "after" else "after"
+    assert f"; the other one is checkpoints/{other}.pt\n" in done.out
+    assert load_agent(run / f"checkpoints/{other}.pt").score == min(after, before)
     assert trained_agent(run).training.seed == 0
     metrics = json.loads((run / "metrics.json").read_text())
     assert metrics["score"]["mean"] == max(after, before)
@@ -60,7 +67,8 @@ def test_tensorboard_shows_cart_and_simulation_side_by_side(tuned: tuple[Path, O
 
 def test_one_that_has_ended_has_no_state_to_resume(tuned: tuple[Path, Outcome], tmp_path: Path) -> None:
     run, _ = tuned
-    assert [path.name for path in (run / "checkpoints").iterdir()] == ["last.pt"]
+    names = {path.name for path in (run / "checkpoints").iterdir()}
+    assert names in ({"last.pt", "before.pt"}, {"last.pt", "after.pt"})
     done = in_process("finetune", f"resume={run}", "hydra.run.dir=other", folder=tmp_path)
     assert done.code == 2
     assert "leave out hydra.run.dir" in done.complaint
@@ -123,6 +131,52 @@ def lose_the_learner(run: Path) -> None:
     state = {"agent": saved.state["agent"], "learner": "name"}
     config = {**saved.config, "learner": learner}
     save_training(run, TrainingCheckpoint(config, state, saved.step), FINETUNING_FORMAT)
+
+
+def unfinished(run: Path, agent: Path, is_compiled: bool) -> None:
+    """Write the run folder of a fine-tuning on a real cart that has driven no episode."""
+    words = {"run": str(agent), "compile": is_compiled, "plant": "serial", "plant.port": "/dev/first"}
+    config = load_settings(FinetuneConfig, words)
+    write_config(run, "finetune", config.model_dump(mode="json"), agent=agent / "checkpoints/last.pt")
+    FinetuningFiles(run, config).save({}, 0)
+
+
+def test_a_resumed_run_reaches_its_cart_on_another_port(
+    trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And an error of the cart says how the run goes on."""
+    unfinished(tmp_path / "run", trained, is_compiled=False)
+    words = (
+        "resume=run",
+        "plant.port=/dev/gone",
+        "plant.clear_faults=3",
+        "plant.home_timeout=200",
+        "view=none",
+    )
+
+    def fail(files: FinetuningFiles, *_: object) -> None:
+        plant = files.config.plant
+        raise PortError(f"{plant.port} {plant.clear_faults} {plant.home_timeout} {plant.timeout}")
+
+    monkeypatch.setattr("cartpole_rl.workflows.finetune.drive_all", fail)
+    done = in_process("finetune", *words, folder=tmp_path)
+    hint = f"cartpole-finetune resume={tmp_path}/run continues it"
+    assert done.complaint == f"cartpole-finetune: /dev/gone 3 200.0 1.0; {hint}"
+    assert done.code == 1
+    done = in_process("finetune", "resume=run", "plant.timeout=2", folder=tmp_path)
+    assert done.complaint.endswith("resume uses that run's own config; leave out plant.timeout=2")
+    done = in_process("finetune", "resume=other", "plant.port=/dev/gone", folder=tmp_path)
+    assert done.complaint == "cartpole-finetune: resume=other/config.yaml: there is no such file"
+
+
+def test_what_a_resumed_run_compiles_with_is_missed_before_the_cart_moves(
+    trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    unfinished(tmp_path / "run", trained, is_compiled=True)
+    shutil.copy(trained / "checkpoints/last.pt", tmp_path / "run/checkpoints/start.pt")
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    done = in_process("finetune", "resume=run", folder=tmp_path)
+    assert "compile=true finds no C++ compiler no-such-compiler" in done.complaint
 
 
 def test_what_the_simulation_reads_is_missed_before_the_cart_moves(trained: Path, tmp_path: Path) -> None:

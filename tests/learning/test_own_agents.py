@@ -12,9 +12,11 @@ import pytest
 from cartpole_rl.agents.settings import AGENTS
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.episodes import run_batch
+from cartpole_rl.learning.checkpoints import AgentCheckpoint, save_agent
 from cartpole_rl.reporting.loggers import LOGGERS
-from cartpole_rl.workflows.build import network_of, trained_agent
-from cartpole_rl.workflows.config import TrainConfig, load_settings
+from cartpole_rl.workflows.build import network_of, new_agent, trained_agent
+from cartpole_rl.workflows.config import FinetuneConfig, TrainConfig, load_settings
+from cartpole_rl.workflows.finetune import finetune
 from cartpole_rl.workflows.train import nominal_env, train
 
 MODULE = '''
@@ -24,6 +26,7 @@ import torch
 from torchrl.data import Categorical
 from torchrl.modules import QValueActor
 from cartpole_rl.agents.settings import AGENTS
+from cartpole_rl.learning.agent import QAgent
 
 class Search:
     """Random search: the best of some random changes of the weights."""
@@ -64,6 +67,10 @@ class Searched(torch.nn.Module):
 
     def greedy_policy(self):
         return self.policy
+
+@AGENTS.register(learner=Search)
+class SearchedNetwork(QAgent):
+    """Our network, found by random search."""
 
 class Lines:
     def __init__(self, folder, purge_step=None):
@@ -122,6 +129,16 @@ def test_it_is_trained_logged_and_driven(tmp_path: Path) -> None:
     assert json.loads((run / "metrics.json").read_text())["score"]["mean"] == pytest.approx(score)
     with pytest.raises(ConfigError, match=rf"agent\.kind={kind}, .* cannot be exported"):
         network_of(agent)
+
+
+def test_fine_tuning_refuses_one_with_a_learner_of_its_own(tmp_path: Path) -> None:
+    kind, run = "own_agents:SearchedNetwork", tmp_path / "agent.pt"
+    training = load_settings(TrainConfig, {**TOY, "agent.kind": kind})
+    save_agent(
+        run, AgentCheckpoint(training.model_dump(mode="json"), new_agent(training).state_dict(), 0, None)
+    )
+    with pytest.raises(ConfigError, match=rf"a learner of its own, and so has agent\.kind={kind}; give an"):
+        finetune(load_settings(FinetuneConfig, {"run": str(run), "compile": False}), tmp_path / "run")
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import io
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,10 +11,11 @@ import numpy as np
 import pytest
 import torch
 from short_episode import EPISODE
+from short_episode import FULL as BROKEN
 
 from cartpole_rl.choices import choice
 from cartpole_rl.envs.build import simulated_env
-from cartpole_rl.errors import CheckpointError, LinkError
+from cartpole_rl.errors import CheckpointError, LinkError, RecordingError
 from cartpole_rl.evaluation.driver import EpisodeRequest, EpisodeResult
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.files import write_bytes
@@ -21,14 +23,14 @@ from cartpole_rl.learning.checkpoints import FINETUNING_FORMAT, AgentCheckpoint,
 from cartpole_rl.learning.settings import FinetuningSettings, LearningSettings
 from cartpole_rl.learning.states import seed_everything
 from cartpole_rl.plants.serial.statistics import LinkStatistics
-from cartpole_rl.reporting.tensorboard import TensorBoardLog
-from cartpole_rl.run_folder import write_config
+from cartpole_rl.reporting.tensorboard import TensorBoardLog, scalars
+from cartpole_rl.run_folder import file_hash, recorded_provenance, write_config
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.build import evaluated_settings, new_agent
 from cartpole_rl.workflows.config import FinetuneConfig, TrainConfig, load_settings, recorded_settings
-from cartpole_rl.workflows.finetune import evaluation_config, started_from
+from cartpole_rl.workflows.finetune import evaluation_config, finetune, overlaid, started_from
 from cartpole_rl.workflows.finetuning_cart import FinetuningCart, FinetuningFiles, Stage
-from cartpole_rl.workflows.finetuning_learner import CartLearner, simulated_learning
+from cartpole_rl.workflows.finetuning_learner import CartLearner, TunedAgent, simulated_learning
 
 TRAINING = {
     "task.time_limit": 60,
@@ -67,6 +69,52 @@ def test_the_recordings_say_how_far_a_run_has_come(files: FinetuningFiles) -> No
     assert "# pole_length_m: 0.3530" in files.path(Stage.BEFORE, 0).read_text()
 
 
+@pytest.mark.parametrize(
+    ("missing", "learned", "complaint"),
+    [
+        ("tune_001", 1, "tune_001.csv is missing; put it back, or move the later ones away: they are driven"),
+        ("before_002", 0, "before_002.csv is missing; put it back, or move the later ones away: they are"),
+        ("tune_001", 2, "tune_001.csv is missing; put it back, or start anew: .* run=some"),
+        ("tune_002", 3, "tune_002.csv is missing; put it back, or start anew: .* run=some"),
+        ("tune_002", 2, ""),
+    ],
+)
+def test_no_episode_may_be_missing_before_another_one(
+    missing: str, learned: int, complaint: str, files: FinetuningFiles
+) -> None:
+    for stage in (Stage.BEFORE, Stage.TUNE):
+        for number in range(3):
+            files.write_episode(stage, number, EPISODE)
+    files.check(3)
+    (files.folder / f"recordings/{missing}.csv").unlink()
+    with pytest.raises(RecordingError, match=complaint) if complaint else nullcontext():
+        files.check(learned)
+
+
+def test_a_resumed_run_takes_the_words_alone() -> None:
+    """Which are not those of the learner's file."""
+    given, learner = {"resume": "run", "view": "none"}, {"kind": "ray", "address": "new:1", "timeout": 10}
+    plant = {"kind": "serial", "port": "/dev/other", "clear_faults": 0}
+    given |= {"learner": learner, "plant": plant}
+    ray = {"kind": "ray", "address": "old:1", "timeout": 50}
+    recorded = {
+        "seed": 3,
+        "view": "live",
+        "learner": ray,
+        "plant": {**plant, "port": "COM1", "clear_faults": 2},
+    }
+    words = ["resume=run", "learner=ray", "learner.address=new:1", "plant.port=/dev/other"]
+    assert overlaid(recorded, given, words) == {
+        **recorded,
+        "resume": "run",
+        "learner": {**ray, "address": "new:1"},
+        "plant": {**plant, "clear_faults": 2},
+    }
+    local = {**recorded, "learner": {"kind": "local"}}
+    assert overlaid(local, given, [*words, "view=none"])["learner"] == learner
+    assert overlaid(local, given, ["view=none"]) == {**local, "resume": "run", "view": "none"}
+
+
 def test_a_checkpoint_restores_its_settings(files: FinetuningFiles) -> None:
     files.save({}, 2)
     checkpoint = load_training(files.folder, FINETUNING_FORMAT)
@@ -76,8 +124,11 @@ def test_a_checkpoint_restores_its_settings(files: FinetuningFiles) -> None:
         recorded_settings(FinetuneConfig, {"run": "somewhere", "prior": 0.1}, "resume=run")
 
 
+LONG = replace(EPISODE, time=50 * EPISODE.time)  # 2 s
+
+
 class Script:
-    """A driver whose episodes end as `endings` say."""
+    """A driver whose episodes end as `endings` say: "encoder" is its fault, "late" a link lost after 2 s."""
 
     def __init__(self, *endings: str) -> None:
         self.endings = iter(endings)
@@ -88,8 +139,9 @@ class Script:
     def result(self) -> EpisodeResult:
         """Return the next episode."""
         ending = next(self.endings)
-        episode = EPISODE.first(0) if ending == "empty" else EPISODE
-        return EpisodeResult(replace(episode, ended_by=ending.replace("empty", "fault")), LinkStatistics())
+        episode = {"empty": EPISODE.first(0), "encoder": BROKEN, "late": LONG}.get(ending, EPISODE)
+        ended_by = {"empty": "fault", "encoder": "fault", "late": "link"}.get(ending, ending)
+        return EpisodeResult(replace(episode, ended_by=ended_by), LinkStatistics())
 
 
 @pytest.fixture
@@ -101,22 +153,35 @@ def log(tmp_path: Path) -> Iterator[TensorBoardLog]:
 def test_an_evaluation_that_the_link_ended_is_driven_again(
     files: FinetuningFiles, log: TensorBoardLog, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    cart = FinetuningCart(Script("time", "link", "link", "fault", "link", "link", "link"), files, log)
+    script = Script("time", "link", "encoder", "fault", "late", "link", "link")
+    cart = FinetuningCart(script, files, log, "score")
     with pytest.raises(LinkError, match=r"before 3: the link was lost after 0\.0 s, 3 times in succession"):
         cart.evaluate(Stage.BEFORE, {})
     assert [each.ended_by for each in files.episodes(Stage.BEFORE)] == ["time", "fault"]
     told = "before 2: the link was lost after 0.0 s; the episode does not count and is driven again"
     assert capsys.readouterr().out.splitlines()[1] == told
-    cart = FinetuningCart(Script("link"), files, log)
-    cart.finish(Stage.TUNE, 0)  # one to learn from counts until then
-    assert files.episode(Stage.TUNE, 0).ended_by == "link"
+    cart = FinetuningCart(Script("link", "late"), files, log, "score")
+    cart.start_tuning(0, {})
+    cart.finish(Stage.TUNE, 0)  # one to learn from counts until then, unless it is too short
+    assert files.episode(Stage.TUNE, 0).time[-1] == 2.0
+
+
+def test_an_episode_is_scored_as_its_task_is(
+    files: FinetuningFiles, log: TensorBoardLog, capsys: pytest.CaptureFixture[str]
+) -> None:
+    FinetuningCart(Script(), files, log, "score_upright").keep(
+        Stage.BEFORE, 0, replace(EPISODE, score_upright=np.array([3.0, 4.0])), LinkStatistics()
+    )
+    assert capsys.readouterr().out == "before 1: score 7, ended by time\n"
+    assert scalars(files.folder, "cart/score_before") == [(1, 7.0)]
 
 
 @pytest.mark.parametrize("stage", [Stage.BEFORE, Stage.TUNE])
 def test_an_episode_without_a_measured_period_is_driven_again(
     stage: Stage, files: FinetuningFiles, log: TensorBoardLog
 ) -> None:
-    cart = FinetuningCart(Script("empty", "empty", "fault", "empty", "empty", "empty"), files, log)
+    script = Script("empty", "empty", "fault", "empty", "empty", "empty")
+    cart = FinetuningCart(script, files, log, "score")
     cart.start({}, 0.0, 0)
     cart.finish(stage, 0)
     assert [each.steps for each in files.episodes(stage)] == [2]
@@ -140,6 +205,25 @@ def test_without_its_copy_of_the_agent_a_run_takes_the_same_one_and_no_other(tmp
     )
     write_bytes(interrupted.start, b"a copy")
     assert started_from(interrupted) == interrupted.start
+
+
+def test_the_agent_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The training that it is of goes on, and replaces it."""
+    training, run, folder = load_settings(TrainConfig, TRAINING), tmp_path / "agent.pt", tmp_path / "run"
+    agent = AgentCheckpoint(training.model_dump(mode="json"), new_agent(training).state_dict(), 10, None)
+    save_agent(run, agent)
+
+    def write_and_train(*words: Any, **named: Any) -> None:
+        write_config(*words, **named)
+        save_agent(run, replace(agent, transitions=20))
+
+    def check(files: FinetuningFiles, tuned: TunedAgent, *_: object) -> None:
+        assert file_hash(files.start) == recorded_provenance(folder)["agent_sha256"] != file_hash(run)
+        assert tuned.start.transitions == 10
+
+    monkeypatch.setattr("cartpole_rl.workflows.finetune.write_config", write_and_train)
+    monkeypatch.setattr("cartpole_rl.workflows.finetune.drive_all", check)
+    finetune(load_settings(FinetuneConfig, CONFIG | {"run": str(run)}), folder)
 
 
 def test_learning_in_simulation_follows_the_settings() -> None:
@@ -246,6 +330,21 @@ def test_a_refit_that_fails_keeps_the_earlier_fit(
     assert "the simulator keeps its earlier fit: no cart moves as" in capsys.readouterr().err.splitlines()[-1]
     assert torch.equal(late.carts, carts)
     assert len(late.loop.buffer) == capacity
+
+
+def test_learning_begins_without_a_fit_and_takes_a_later_one(
+    recorded: list[Episode], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The pole fell at once in each episode before the fine-tuning."""
+    learner = new_learner()
+    assert learner.start([recorded[0].first(9)])["cart/score_in_simulation"] > 0
+    line = capsys.readouterr().err.splitlines()[-1]
+    told = "the simulator is not fitted yet, its carts are drawn as in training: no recording lasts 0.5 s"
+    assert line == f"cartpole-finetune: {told}: record longer"
+    carts = learner.carts
+    for episode in recorded[:2]:
+        learner.add(episode)
+    assert not torch.equal(learner.carts, carts)
 
 
 def test_what_is_not_learned_from_is_told(

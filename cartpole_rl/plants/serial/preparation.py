@@ -111,7 +111,7 @@ class FaultClearing:
         if self.unattended:
             return f"{self.cleared} faults were cleared unattended (plant.clear_faults): check the cart"
         return (
-            "check the cart, then start again in a terminal and confirm; for unattended work, "
+            "check the cart, then confirm in a terminal that it may move; for unattended work, "
             "plant.clear_faults=3 clears three faults without asking"
         )
 

@@ -238,7 +238,7 @@ def test_a_latched_fault_is_not_cleared_with_nobody_asked(
     peer.state = replace(peer.state, fault=int(fault))
     assert step(plant, 100)["done"]
     homings = len(peer.messages(Home))
-    with pytest.raises(FaultError, match=r"check the cart, then start again in a terminal and confirm"):
+    with pytest.raises(FaultError, match=r"check the cart, then confirm in a terminal that it may move"):
         plant.reset()
     assert not peer.messages(ClearFault)
     assert len(peer.messages(Home)) == homings
