@@ -62,7 +62,8 @@ OWN = Group("own", "its own evaluation")  # the result of a run without further 
 class Agent:
     """One run of a group. `values` maps evaluations to the measure; `curves` are those of its training.
 
-    `behaviour` maps evaluations to further means over the episodes, by their keys in metrics.json.
+    `behaviour` maps evaluations to further means over the episodes, by their keys in metrics.json. `seeds`
+    are those of the runs that made the agent, the last one first; `source` is what the run starts from.
     """
 
     group: str
@@ -72,6 +73,13 @@ class Agent:
     curves: Mapping[str, Curve] = field(default_factory=dict)
     behaviour: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     folders: Mapping[str, str] = field(default_factory=dict)  # of evaluations that are elsewhere
+    seeds: tuple[int, ...] | None = None  # None: `seed` alone
+    source: str = ""
+
+    @property
+    def seed_text(self) -> str:
+        """The seeds for people, see `seeds_text`."""
+        return seeds_text((self.seed,) if self.seeds is None else self.seeds)
 
 
 @dataclass(frozen=True)
@@ -131,6 +139,12 @@ class Results:
             return Path(agent.folders[evaluation])
         inner = Path(agent.run, EVALUATIONS, evaluation)
         return Path(agent.run) if evaluation == OWN.name and not inner.is_dir() else inner
+
+
+def seeds_text(seeds: Sequence[int]) -> str:
+    """Return the seeds of the runs that made an agent: "2", or "0 (agent 10)" of a fine-tuned one."""
+    first, rest = [*map(str, seeds[:1])], [f"(agent {seed})" for seed in seeds[1:]]
+    return " ".join([*first, *rest]) or "–"
 
 
 def is_number(value: Any) -> bool:

@@ -26,7 +26,13 @@ from cartpole_rl.reporting.results import (
     value_text,
 )
 from cartpole_rl.reporting.runs import short
-from cartpole_rl.reporting.statistics import difference, estimate, probability_of_improvement
+from cartpole_rl.reporting.statistics import (
+    difference,
+    estimate,
+    paired_difference,
+    paired_improvement,
+    probability_of_improvement,
+)
 from cartpole_rl.reporting.style import svg
 from cartpole_rl.reporting.texts import count_text, number_text
 from cartpole_rl.run_folder import ANIMATION, FIGURES, TABLE
@@ -43,7 +49,8 @@ MOST_EXCLUSIONS = 40  # runs named one by one
 OF_RUNS = ("The runs are of ", ": each agent has its own ")  # in notes that stand with the list of runs
 METHOD = (
     "Each number of an agent is the mean over its evaluation episodes; the last checkpoint of every seed "
-    "counts and no agent is picked. A controller without training counts once per seed of its evaluation. "
+    "counts and no agent is picked. A controller without training counts once per seed of its evaluation, "
+    "a pretrained agent once. "
     "Values are interquartile means over agents (the mean without the lowest and the highest quarter) with "
     "the 95 % interval of a stratified bootstrap over agents, after Agarwal et al. (2021). With ten agents "
     "about 94 of 100 such intervals cover the true value, with three only 73. Runs that are unfinished, "
@@ -162,26 +169,13 @@ def comparison(first: Results, second: Results, between: Mapping[str, Sequence[s
     """Return the section that compares two sets group by group, by the labels of their groups."""
     names = first.title, second.title
     values = [
-        {
-            group.label: found
-            for group in each.groups
-            if (found := each.values(group.name, each.evaluations[0].name)).size
-        }
+        {group.label: found for group in each.groups if (found := _judged_values(each, group.name))}
         for each in (first, second)
     ]
+    several = [each.judged[0].label for each in (first, second) if len(each.evaluations) > 1]
     rows = [
-        {
-            "group": label,
-            names[0]: estimate_text(estimate(ours)),
-            names[1]: estimate_text(estimate(others)),
-            "difference, 95 % interval": estimate_text(difference(others, ours)),
-            f"chance that {names[1]} is higher": estimate_text(probability_of_improvement(others, ours)),
-            "agents": f"{ours.size} and {others.size}",
-        }
-        for label, ours in ends(
-            {label: own for label, own in values[0].items() if label in values[1]}.items()
-        )
-        for others in [values[1][label]]
+        {"group": label, **_compared(names, values[0][label], values[1][label])}
+        for label in ends([label for label in values[0] if label in values[1]])
     ]
     lone = [
         f"{label} is only in {name}."
@@ -193,7 +187,7 @@ def comparison(first: Results, second: Results, between: Mapping[str, Sequence[s
         {"setting": name, names[0]: settings[0], names[1]: settings[1]} for name, settings in between.items()
     ]
     parts = [
-        '<section id="comparison"><h2>Comparison</h2>',
+        f'<section id="comparison"><h2>{escaped(", ".join(["Comparison", *dict.fromkeys(several)]))}</h2>',
         f"<p>Settings that differ:</p>{folded(differs, 'settings')}"
         if differs
         else "<p>No setting differs.</p>",
@@ -202,6 +196,32 @@ def comparison(first: Results, second: Results, between: Mapping[str, Sequence[s
         "</section>",
     ]
     return "\n".join(parts)
+
+
+def _judged_values(results: Results, group: str) -> dict[tuple[Any, ...], float]:
+    """Return the value of each agent of a group in the evaluation that counts, by its source and seeds."""
+    name = results.judged[0].name
+    return {
+        (each.source, each.seeds): each.values[name] for each in results.members(group) if name in each.values
+    }
+
+
+def _compared(
+    names: tuple[str, str], first: Mapping[Any, float], second: Mapping[Any, float]
+) -> dict[str, str]:
+    """Return the cells that compare two sets of agents: in pairs if both have the same ones."""
+    paired = first.keys() == second.keys()
+    ours, others = [*first.values()], [second[key] for key in (first if paired else second)]
+    apart, higher = (
+        (paired_difference, paired_improvement) if paired else (difference, probability_of_improvement)
+    )
+    return {
+        names[0]: estimate_text(estimate(ours)),
+        names[1]: estimate_text(estimate(others)),
+        "difference, 95 % interval": estimate_text(apart(others, ours)),
+        f"chance that {names[1]} is higher": estimate_text(higher(others, ours)),
+        "agents": f"{len(ours)}, paired" if paired else f"{len(ours)} and {len(others)}, unpaired",
+    }
 
 
 def figure_parts(
@@ -290,7 +310,7 @@ def run_list(results: Results) -> str:
     if not results.agents:
         return ""
     rows = [
-        {"run": agent.run, "seed": agent.seed, **_named_values(results, agent)}
+        {"run": agent.run, "seed": agent.seed_text, **_named_values(results, agent)}
         for agent in results.agents[:MOST_LISTED]
     ]
     notes = filter(_is_of_runs, results.notes)
@@ -352,8 +372,9 @@ class Gallery:
         label = measure_label(results.measure)
         labels = {group.name: group.label for group in results.groups}
         for name, agent, value, path in chosen(results):
-            text = f"{name}: {labels[agent.group]}, seed {agent.seed}, {label} {number_text(value)}"
-            alt = f"Animation of one episode of the {name} agent ({labels[agent.group]}, seed {agent.seed})"
+            which = f"{labels[agent.group]}, seed {agent.seed_text}"
+            text = f"{name}: {which}, {label} {number_text(value)}"
+            alt = f"Animation of one episode of the {name} agent ({which})"
             if data := self._read(path, lambda path: smaller(path, self.width, self.every)):
                 yield Picture(data, "gif", alt, text)
 
@@ -403,7 +424,7 @@ def _chosen_figures(results: Results) -> Iterator[tuple[Path, str]]:
         return
     for name, agent, _, path in chosen(results)[:2][-1:]:  # the median; of fewer than three, the last
         if (file := path.with_name("behaviour.png")).is_file():
-            yield file, f"An episode of the {name} agent over time (seed {agent.seed})"
+            yield file, f"An episode of the {name} agent over time (seed {agent.seed_text})"
 
 
 def _figure(path: Path) -> bytes:

@@ -88,9 +88,20 @@ def difference(values: ArrayLike, others: ArrayLike) -> Estimate:
     return bootstrap(lambda a, b: interquartile_mean(a) - interquartile_mean(b), values, others)
 
 
+def paired_difference(values: ArrayLike, others: ArrayLike) -> Estimate:
+    """Return IQM(values - others) of the same agents [n] in both, whose pairs are resampled."""
+    return estimate(np.subtract(values, others))
+
+
 def probability_of_improvement(values: ArrayLike, others: ArrayLike) -> Estimate:
     """Return the probability that an agent of `values` [n] scores more than one of `others` [m]."""
     return bootstrap(_share_above, values, others)
+
+
+def paired_improvement(values: ArrayLike, others: ArrayLike) -> Estimate:
+    """Return the share of the same agents [n] that score more in `values`; ties count half."""
+    signs = np.sign(np.subtract(values, others))
+    return bootstrap(lambda sample: 0.5 + 0.5 * sample.mean(axis=-1), signs)
 
 
 def _share_above(values: Array, others: Array) -> Array:

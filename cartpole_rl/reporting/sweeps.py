@@ -14,8 +14,9 @@ from typing import Any
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.reporting.grouping import AGENT, NULL, SOURCE, Columns, fewest, labels, setting_columns
 from cartpole_rl.reporting.groups import LONGEST_LABEL, MOST_LINES
-from cartpole_rl.reporting.results import OWN, Agent, Curve, Exclusion, Group, Results
+from cartpole_rl.reporting.results import OWN, Agent, Curve, Exclusion, Group, Results, seeds_text
 from cartpole_rl.reporting.runs import (
+    EPISODIC,
     Run,
     commits_note,
     find_runs,
@@ -44,8 +45,9 @@ OVERRIDE = re.compile(r"\+{0,2}([a-z_][\w.]*)=(.*)")  # on a command line
 class Member:
     """A run of a sweep with the settings that it is grouped by: its own and those of its `agent`.
 
-    `agent` is the run that made the agent which this run evaluates; None if there is no such run. `seeds` are
-    those of the agent, of the one that it was fine-tuned from, and so on.
+    `agent` is the run that made the agent which this run starts from; None if there is no such run. `seeds`
+    are those of the run that made the agent, of the one that it was fine-tuned from, and so on; a pretrained
+    agent has none.
     """
 
     run: Run
@@ -56,7 +58,13 @@ class Member:
     @property
     def seed(self) -> int:
         """The seed of the training at the end of the chain."""
-        return self.seeds[-1]
+        return (0, *self.seeds)[-1]
+
+    @property
+    def source(self) -> str:
+        """The agent that the run starts from, or the run itself."""
+        lost = not self.agent and self.run.agent
+        return lost or os.path.realpath((self.agent or self.run).folder)
 
     @property
     def versions(self) -> str:
@@ -287,11 +295,13 @@ def _agents(kept: Sequence[Kept], measure: str, curves: Mapping[Path, Mapping[st
     return [
         Agent(
             label,
-            seeds[-1],
+            (0, *seeds)[-1],
             ", ".join(member.run.folder.as_posix() for member in own.values()),
             {name: value for each, member in own.items() for name, value in _values(each, member, measure)},
             curves[next(iter(own.values())).run.folder],
             folders={each: member.run.folder.as_posix() for each, member in own.items()},
+            seeds=seeds,
+            source=next(iter(own.values())).source,
         )
         for (label, seeds), own in found.items()
     ]
@@ -318,7 +328,8 @@ def without_repetitions(sweep: Sweep) -> tuple[list[Kept], list[Exclusion]]:
     repeated = []
     for member, label, evaluation in zip(sweep.members, sweep.labels, sweep.evaluations, strict=True):
         if (label, evaluation, member.seeds) in kept:
-            repeated.append(_exclusion(member.run, f"seed {member.seed} of {label} is there twice"))
+            which = f"seed {seeds_text(member.seeds)}" if member.seeds else "the agent"
+            repeated.append(_exclusion(member.run, f"{which} of {label} is there twice"))
         else:
             kept[label, evaluation, member.seeds] = member, label, evaluation
     return [*kept.values()], repeated
@@ -371,8 +382,9 @@ def _member(run: Run, agents: dict[Path, Run]) -> Member:
         tree[AGENT] = _agent_tree((run, *chain))
     elif run.agent:
         tree[SOURCE] = run.agent
-    seeds = tuple(each.seed or 0 for each in chain or [run])
-    return Member(run, chain[0] if chain else None, tree, seeds)
+    drives = run.program in EPISODIC and (chain or Path(run.agent).parts[:1] == (PRETRAINED,))
+    made_by = chain if drives else [run, *chain]
+    return Member(run, chain[0] if chain else None, tree, tuple(each.seed or 0 for each in made_by))
 
 
 def _chain(run: Run, agents: dict[Path, Run]) -> list[Run]:
@@ -406,7 +418,8 @@ def _unequal_seeds(sweep: Sweep) -> list[str]:
     """Return notes that name the groups that lack seeds which others have."""
     seeds: dict[str, set[int]] = {}
     for member, label in zip(sweep.members, sweep.labels, strict=True):
-        seeds.setdefault(label, set()).add(member.seed)
+        if member.seeds:
+            seeds.setdefault(label, set()).add(member.seed)
     everything = set().union(*seeds.values())
     lacking = [label for label, own in seeds.items() if own != everything]
     named = [f"{label} lacks {_seeds(everything - seeds[label])}" for label in lacking[:MOST_LACKING]]

@@ -65,9 +65,10 @@ def _heads(sweep: Sweep) -> Iterator[tuple[Path, dict[str, Hashable]]]:
         head |= {
             "group": label,
             "evaluation": evaluation,
-            "seed": member.seed,
+            "seed": (*member.seeds, None)[0],
             "left_out": repeated.get(run, ""),
         }
+        head |= {"agent_seed": member.seed} if len(member.seeds) > 1 else {}
         yield (
             member.run.folder,
             head | {f"setting:{key}": each[number] for key, each in sweep.columns.items()},

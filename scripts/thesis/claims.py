@@ -48,6 +48,7 @@ from cartpole_rl.reporting.statistics import (
     difference,
     estimate,
     interquartile_mean,
+    paired_difference,
 )
 from cartpole_rl.settings import Settings
 
@@ -164,7 +165,7 @@ STATISTICS: Mapping[str, tuple[str, Callable[..., Estimate]]] = {  # name: in wo
         lambda values, others: _exact(np.abs(values - others).max(), values.size),
     ),
     "over": ("", _share),
-    "gain": ("difference", lambda values, others: estimate(values - others)),
+    "gain": ("difference", paired_difference),
     "percent": ("", lambda whole, values: estimate(100 * values / whole)),
     "less": ("percent less", lambda values, others: bootstrap(_percent_less, values, others)),
     "difference": ("difference", difference),

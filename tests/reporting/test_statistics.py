@@ -7,8 +7,11 @@ from scipy import stats
 from cartpole_rl.reporting.runs_page import METHOD
 from cartpole_rl.reporting.statistics import (
     RESAMPLES,
+    difference,
     estimate,
     interquartile_mean,
+    paired_difference,
+    paired_improvement,
     performance_profile,
     probability_of_improvement,
 )
@@ -75,6 +78,16 @@ def test_probability_of_improvement_is_the_share_of_pairs_in_every_resample() ->
     found = probability_of_improvement(values, others)
     assert found.value == 0.5 + 0.5 * np.sign(values[:, None] - others).mean()
     np.testing.assert_array_equal([found.low, found.high], np.percentile(shares, [2.5, 97.5]))
+
+
+def test_the_same_agents_are_compared_in_pairs() -> None:
+    """Agents that differ by 900 and all gain about 50 show a difference that independent ones do not show."""
+    gains = np.linspace(30, 70, 10)
+    found, apart = paired_difference(SCORES + gains, SCORES), difference(SCORES + gains, SCORES)
+    assert found.value == pytest.approx(50)
+    assert 30 < found.low < 50 < found.high < 70
+    assert apart.low < 0
+    assert paired_improvement([2.0, 3.0, 1.0, 5.0], [1.0, 3.0, 2.0, 4.0]).value == 0.625
 
 
 def test_a_profile_falls_from_one_to_nothing() -> None:

@@ -12,6 +12,7 @@ import pytest
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.reporting.runs_page import comparison
 from cartpole_rl.reporting.sweeps import Sweep, grouped, read_groups, read_sweeps, results_of
+from cartpole_rl.reporting.tables import run_rows
 
 Edit = Callable[[Path, Callable[[Any], object]], None]
 MEASURE = "score_upright"
@@ -117,6 +118,7 @@ def test_settings_that_tell_two_sets_apart_are_not_part_of_the_groups(study: Pat
     for label, text in zip(("cart_mass=1.5", "default"), differences, strict=True):
         assert float(text.split()[0]) == pytest.approx(means[1][label].value - means[0][label].value, abs=0.1)
     assert "is only in" not in page
+    assert cells(page, "agents") == ["3, paired"] * 2  # energy and LQR with the same seeds
 
 
 def test_failed_jobs_and_links_are_named_or_followed(study: Path) -> None:
@@ -204,9 +206,58 @@ def test_a_fine_tuning_is_drawn_before_and_after(study: Path, edit: Edit) -> Non
         (folder / "comparison.json").write_text(json.dumps(stages))
     (tuned, _), _ = read_groups({"runs": ["quick"]}, MEASURE)
     results = results_of(tuned, MEASURE)
+    page = comparison(results, results, {})
+    assert "<h2>Comparison, after</h2>" in page
+    assert cells(page, results.title) == ["6.0 (5.0 to 7.0)"]
     assert [each.label for each in results.evaluations] == ["before", "after"]
     assert [agent.values for agent in results.agents] == [
         {"before": 1.0, "after": 5.0},
         {"before": 2.0, "after": 6.0},
         {"before": 3.0, "after": 7.0},
     ]
+
+
+def test_fine_tunings_of_one_agent_are_told_apart_by_their_own_seeds(study: Path, edit: Edit) -> None:
+    shutil.copytree(study / "much/10/evaluations/heavy", "agents/10")
+    for seed in (10, 11, 12):
+        folder = study / f"much/{seed}/evaluations/heavy"
+        edit(folder / "provenance.json", lambda content: content.update(program="cartpole-finetune"))
+        edit(folder / "config.yaml", lambda content: content.update(run="agents/10"))
+        (folder / "comparison.json").write_text("{}")
+    (tuned,), _ = read_groups({"runs": ["quick/friction/much/*/evaluations/heavy"]}, MEASURE)
+    results = results_of(tuned, MEASURE)
+    assert results.exclusions == ()
+    assert [agent.seed_text for agent in results.agents] == [f"{n} (agent 10)" for n in (10, 11, 12)]
+    assert [(row["seed"], row["agent_seed"]) for row in run_rows([tuned])] == [(10, 10), (11, 10), (12, 10)]
+
+
+def test_evaluations_of_a_pretrained_agent_with_other_seeds_are_of_one_agent(study: Path, edit: Edit) -> None:
+    for seed in (10, 11, 12):
+        file = study / f"much/{seed}/evaluations/heavy/config.yaml"
+        edit(file, lambda content: content.update(run="pretrained/medium"))
+    (sweep,), _ = read_groups({"runs": ["quick/friction/*/*/evaluations/heavy"]}, MEASURE)
+    results = results_of(sweep, MEASURE)
+    (agent,) = (agent for agent in results.agents if "much" in agent.run)
+    assert (agent.run, agent.seed_text) == ("quick/friction/much/10/evaluations/heavy", "–")
+    label = results.groups[1].label
+    assert [each.reason for each in results.exclusions] == [f"the agent of {label} is there twice"] * 2
+    assert not [note for note in results.notes if "lacks" in note]
+
+
+def test_agents_of_a_training_are_compared_in_pairs_on_two_carts(study: Path, edit: Edit) -> None:
+    for seed in (10, 11, 12):
+        shutil.copytree(study / f"little/{seed}/evaluations/heavy", f"agents/{seed}")
+        for arm in ("little", "much"):
+            file = study / f"{arm}/{seed}/evaluations/heavy/config.yaml"
+            edit(file, lambda content, seed=seed: content.update(run=f"agents/{seed}"))
+
+    def compared(second: str) -> str:
+        sets = {"runs": ["quick/friction/little/*/evaluations/heavy"], "compare": [second]}
+        sweeps, between = read_groups(sets, MEASURE)
+        assert between is not None
+        return comparison(*(results_of(sweep, MEASURE) for sweep in sweeps), between)
+
+    page = compared("quick/friction/much/*/evaluations/heavy")
+    assert cells(page, "agents") == ["3, paired"]
+    assert cells(page, "chance that compare is higher") == ["0 (0 to 0)"]
+    assert cells(compared("quick/friction/much/1[01]/evaluations/heavy"), "agents") == ["3 and 2, unpaired"]
