@@ -37,7 +37,7 @@ from cartpole_rl.wire import Fault, Flags, Reason
 from cartpole_rl.wire.frames import LONGEST_FRAME, VERSION
 from cartpole_rl.wire.messages import MESSAGES
 
-LONGEST_LATENCY = 0.04  # s, that the reader can choose
+LONGEST_LATENCY = 0.04  # s, that the reader can choose, and the nominal one where that is longer
 RODS = [length / 100 for length in range(20, 101, 4)]  # m, poles that the reader can choose
 
 
@@ -113,9 +113,14 @@ def physics(settings: CartPoleSettings, plant: SimulationSettings) -> Graph:
             addition=pushed,
         )
 
-    drive = torch.zeros(1 + commands_under_way(LONGEST_LATENCY, period), 1)
+    drive = torch.zeros(1 + commands_under_way(longest_latency(settings), period), 1)
     carts = Carts(torch.ones(len(CartParameters.names()), 1), torch.zeros(4, 1), drive)
     return Graph.of(run, carts, Inputs(COUNT, torch.zeros(3, 1)), Push(NUMBER, NUMBER))
+
+
+def longest_latency(settings: CartPoleSettings) -> float:
+    """Return the longest latency that the page simulates, s."""
+    return max(LONGEST_LATENCY, settings.nominal_cart["latency"])
 
 
 def function(name: str, graph: Graph) -> str:
@@ -154,8 +159,8 @@ def data(agent: ExportedAgent, settings: CartPoleSettings) -> str:
         "cart": settings.nominal_with(pole),
         "poles": [each.model_dump() for each in poles],
         "trained": poles.index(pole),
-        "commands": commands_under_way(LONGEST_LATENCY, about.control_period),
-        "longestLatency": LONGEST_LATENCY,
+        "commands": commands_under_way(longest_latency(settings), about.control_period),
+        "longestLatency": longest_latency(settings),
         "wire": wire(settings),
     }
     return json.dumps(content)

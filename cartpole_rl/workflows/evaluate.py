@@ -11,6 +11,7 @@ from cartpole_rl.reporting.animation import side_by_side, write_animation
 from cartpole_rl.reporting.episodes import report_episodes
 from cartpole_rl.reporting.scores import score_columns, score_table
 from cartpole_rl.reporting.texts import count_text, cut_off
+from cartpole_rl.rig.hardware import nominal_hardware
 from cartpole_rl.rig.parameters import PARAMETERS
 from cartpole_rl.run_folder import (
     BASELINE,
@@ -98,8 +99,15 @@ def next_command(evaluation: Evaluation) -> str:
     config, known = evaluation.config, evaluation.known_poles
     run, plant = as_word("run", shown(config.run)), plant_words(config.plant, config.emulator, known)
     if config.run == BASELINE:
-        of_cart = words_given("cart", "pole", "control_period") or ["experiment=medium"]
-        return " ".join(["cartpole-train", *of_cart])
+        of_cart = words_given("cart", "pole", "control_period")
+        if evaluation.settings.hardware == nominal_hardware():
+            return " ".join(["cartpole-train", *(of_cart or ["experiment=medium"])])
+        pole = evaluation.settings.pole  # no ranges are known that hold this cart: it is measured
+        of_cart += [] if words_given("pole") else [f"pole={emulator_for([pole]) or '<yours>.yaml'}"]
+        if not config.plant.is_on_port:
+            own = pole.name not in POLES
+            plant = "plant=emulated emulator=<yours>.yaml" if own else emulated_words([pole])
+        return " ".join(["cartpole-identify", *of_cart, plant])
     if not config.plant.is_on_port:
         poles = known if config.pole is None and known else [evaluation.settings.pole]
         return f"cartpole-evaluate {run} {emulated_words(poles)}"

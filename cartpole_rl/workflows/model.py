@@ -37,10 +37,10 @@ from cartpole_rl.reporting.texts import count_text
 from cartpole_rl.rig.hardware import Hardware, hardware_of, nominal_hardware
 from cartpole_rl.run_folder import FIGURES, MODELLED, recordings, write_config, write_json
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.terminal import as_word, print_results, progress_bar, shown, waiting
+from cartpole_rl.terminal import as_word, print_results, progress_bar, shown, waiting, words_given
 from cartpole_rl.workflows.build import use_threads
 from cartpole_rl.workflows.config import ModelConfig
-from cartpole_rl.workflows.poles import chosen_pole
+from cartpole_rl.workflows.poles import POLES, chosen_pole
 
 FIGURE = f"{FIGURES}/model.png"
 FRICTION_MODELS = (CART_FRICTIONS.find("sigmoid"), CART_FRICTIONS.find("step"))  # candidates for the cart
@@ -85,16 +85,18 @@ def learn_model(config: ModelConfig, folder: Path) -> None:
     print(
         f"\n{spread_table(errors[LEARNED], CERTAIN, 'RMS errors and ensemble spreads on the same windows')}"
     )
-    print_results(folder, f"{MODEL}, {MODELLED} and {FIGURE}", next_command(model, folder))
+    print_results(folder, f"{MODEL}, {MODELLED} and {FIGURE}", next_command(model, pole_name, folder))
 
 
-def next_command(model: LearnedModel, folder: Path) -> str:
-    """Return the command that trains on a model."""
+def next_command(model: LearnedModel, pole: str, folder: Path) -> str:
+    """Return the command that trains on a model of the pole of this name."""
     words = ["cartpole-train plant=learned", as_word("plant.model", shown(folder))]
     if model.hardware.scales_text != nominal_hardware().scales_text:
         scales = {name: hardware_of(cart).scales_text for name, cart in group_choices("cart").items()}
         alike = (name for name, text in scales.items() if text == model.hardware.scales_text)
-        words.append(f"cart={next(alike, '<yours>.yaml')} pole=<yours>")
+        words.append(f"cart={next(alike, '<yours>.yaml')}")
+    if pole != POLES[0]:  # the default
+        words += words_given("pole") or [f"pole={pole}"]
     if not math.isclose(model.period, choice("train")["control_period"]):
         words.append(f"control_period={model.period:g}")
     return " ".join(words)

@@ -173,7 +173,8 @@ def note_other_carts(config: TrainConfig) -> None:
             print_message(
                 "train",
                 f"note: the cart's {name} is {nominal[name]:g}, but randomization.{name} draws {low:g} to "
-                f"{high:g}: the agent is evaluated on a cart that it does not learn on",
+                f"{high:g}: the agent is evaluated on a cart that it does not learn on; give a "
+                "randomization= that holds it (docs/randomization.md)",
             )
 
 

@@ -9,6 +9,9 @@ import torch
 import yaml
 from command_line import ONCE, TINY, Outcome, in_process
 
+from cartpole_rl.plants.learned import load_model
+from cartpole_rl.workflows.model import next_command
+
 SMALL = (
     "windows=20",
     "ensemble.members=2",
@@ -57,6 +60,12 @@ def test_its_errors_are_written_and_printed(learned: tuple[Path, Outcome], recor
     config = yaml.safe_load((folder / "config.yaml").read_text())
     assert config["from"][1] == str(recorded / "recordings/episode_001.csv")
     assert config["ensemble"]["members"] == 2
+
+
+def test_the_next_command_names_a_pole_that_is_not_the_default(learned: tuple[Path, Outcome]) -> None:
+    words = "cartpole-train plant=learned plant.model=run"
+    assert learned[1].out.splitlines()[-1] == words
+    assert next_command(load_model(learned[0] / "model.pt"), "large", Path("run")) == f"{words} pole=large"
 
 
 @pytest.mark.usefixtures("without_pictures")

@@ -51,6 +51,18 @@ def test_the_preflight_reads_its_file(folder: Path) -> None:
     )
 
 
+@pytest.mark.usefixtures("without_pictures")
+def test_a_controller_on_it_leads_to_its_identification(folder: Path) -> None:
+    (folder / "rod.yaml").write_text("choices: {rod: {pole_mass: 0.05, pole_com: 0.2, pole_inertia: 6.7e-4}}")
+    words = ("run=lqr", "cart=lab.yaml", "guard=none", "task=swingup", "task.time_limit=5", "episodes=1")
+    for given, following in {
+        "pole=rod.yaml control_period=0.01": "plant=emulated emulator=<yours>.yaml",
+        "pole=large": "plant=emulated emulator=large",
+    }.items():
+        done = in_process("evaluate", *words, *given.split(), folder=folder)
+        assert done.out.splitlines()[-1] == f"cartpole-identify cart=lab.yaml {given} {following}", done
+
+
 def test_its_firmware_has_its_numbers(folder: Path) -> None:
     done = in_process("export", "format=firmware", "cart=lab.yaml", "hydra.run.dir=run", folder=folder)
     assert done.code == 0, done

@@ -33,7 +33,8 @@ def test_ranges_without_effect_are_named(tmp_path: Path) -> None:
 def test_a_cart_outside_its_ranges_is_named(tmp_path: Path) -> None:
     assert note(tmp_path, "cart.latency=0.05").endswith(
         "cartpole-train: note: the cart's latency is 0.05, but randomization.latency draws 0 to 0.022: the "
-        "agent is evaluated on a cart that it does not learn on"
+        "agent is evaluated on a cart that it does not learn on; give a randomization= that holds it "
+        "(docs/randomization.md)"
     )
 
 

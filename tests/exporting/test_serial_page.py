@@ -263,17 +263,25 @@ def test_homing_ends_early(page: str, tmp_path: Path, event: str, words: str) ->
 def test_an_agent_that_is_told_the_length_asks_whether_it_is_right(page: str, tmp_path: Path) -> None:
     asked = """
     WIRE.needsLength = true;
-    element("connect").click();
-    await until(() => real?.asking || real?.done);
-    const asked = real.line;
-    real.end("stopped by hand");
-    await until(() => real.done);
+    const asked = [];
+    for (const length of [DATA.trained, DATA.poles.length - 1]) {
+      element("pole").value = length;
+      element("pole").dispatchEvent(new Event("input"));
+      element("connect").click();
+      await until(() => real?.asking || real?.done);
+      asked.push(real.line);
+      element("stop").click();
+      await until(() => real.done);
+      drawSerial();
+      asked.push(element("simulated").disabled);
+      real = null;
+    }
     report([asked, 0, 0]);
     """
-    line, _ = answer(page, asked, tmp_path)
-    assert line.startswith(
-        "Is your pole 0.36 m long? If not, disconnect and choose its length. The cart moves by"
-    )
+    (first, disabled, second, _), _ = answer(page, asked, tmp_path)
+    end = "m long? If not, press Stop, choose its length, and connect again. The cart moves by"
+    assert (first.partition(end)[0], second.partition(end)[0]) == ("Is your pole 0.36 ", "Is your pole 1.00 ")
+    assert not disabled
 
 
 @needs_browser

@@ -21,8 +21,9 @@ from cartpole_rl.plants.simulated import Carts, Inputs, commands_under_way, run_
 from cartpole_rl.plants.specs import Numbers, OneCartPlant, PlantOutput
 from cartpole_rl.rig.hardware import nominal_encoders
 from cartpole_rl.scalar import Scalar
-from cartpole_rl.workflows.build import TrainedAgent, network_of
-from cartpole_rl.workflows.config import TrainConfig
+from cartpole_rl.workflows.build import TrainedAgent, exported_agent, network_of, new_agent
+from cartpole_rl.workflows.config import TrainConfig, load_settings
+from cartpole_rl.workflows.export import page as page_of
 
 PERIODS = 100  # 2 s
 HANGING = {"x": 0.05, "x_dot": 0.0, "theta": math.pi, "theta_dot": 0.0}
@@ -137,6 +138,19 @@ def test_a_balancing_agent_starts_upright_and_fails_when_the_pole_falls(
     start, before, last = in_browser(balancing_page, script, tmp_path)
     assert start == 0
     assert before <= balancing.training.task.angle_limit < last
+
+
+@needs_browser
+def test_a_long_nominal_latency_is_simulated_as_it_is(tmp_path: Path) -> None:
+    given = {"cart.latency": 0.0625, "agent.hidden": [8], "compile": False}
+    training = load_settings(TrainConfig, given)
+    slow = TrainedAgent(training, new_agent(training).greedy_policy())
+    script = """
+    const shown = element("latency-value").textContent;
+    document.body.textContent = JSON.stringify([simulated.parameters.latency, shown, DATA.commands]);
+    """
+    found = in_browser(page_of(exported_agent(slow, {}), slow), script, tmp_path)
+    assert found == [0.0625, "62.5 ms", commands_under_way(0.0625, 0.02)]
 
 
 @needs_browser

@@ -152,7 +152,7 @@ function apply() {
   simulated.parameters.latency = element("latency").value / 1000;
   Object.assign(simulated.parameters, pole);
   element("friction-value").textContent = `${friction.toFixed(1)} × nominal`;
-  element("latency-value").textContent = `${element("latency").value} ms`;
+  element("latency-value").textContent = `${Number(Number(element("latency").value).toFixed(1))} ms`;
   element("pole-value").textContent = `${(200 * pole.pole_com).toFixed(0)} cm`;
 }
 
@@ -163,7 +163,7 @@ function nominal() {
   apply();
 }
 
-element("latency").max = 1000 * DATA.longestLatency;
+element("latency").max = 1000 * DATA.longestLatency; // its step is "any": no latency is rounded
 element("pole").max = DATA.poles.length - 1;
 for (const id of ["friction", "latency", "pole"]) element(id).addEventListener("input", apply);
 element("nominal").addEventListener("click", nominal);

@@ -338,8 +338,9 @@ class SerialCart {
 
   /** Wait until the reader agrees that the cart moves. HELLO keeps an emulated cart without a clock going. */
   async consent(found) {
-    const length = `Is your pole ${this.cart.poleLength[0].toFixed(2)} m long? If not, disconnect and choose its length. `;
-    const asked = `${found}${WIRE.needsLength ? length : ""}`;
+    const length = `Is your pole ${this.cart.poleLength[0].toFixed(2)} m long?`;
+    const other = "If not, press Stop, choose its length, and connect again.";
+    const asked = `${found}${WIRE.needsLength ? `${length} ${other} ` : ""}`;
     this.line = `${asked}The cart moves by itself while it homes: keep the track clear, let the pole hang.`;
     this.agreed = false;
     for (this.asking = true; !this.agreed; await this.seen()) this.send("HELLO");
