@@ -61,6 +61,7 @@ BLOCK = re.compile(r"(<!-- claims: (\w+) -->\n)((?:.+\n)*)")
 FORMULA = re.compile(r"\{([^{}]+)\}")
 WIDTH = 120  # characters of a line of text
 NEAR = 0.05  # an interval within this of a number agrees with "= number"
+LIKE, DROPPED = 50, 250  # of 500: agents that differ by less are alike, the pole is dropped below
 LATE, MIDDLE = 0.75, 0.5  # shares of a training: its last quarter begins, its second one ends
 
 
@@ -150,6 +151,18 @@ def _percent_less(values: Array, others: Array) -> Array:
     return 100 * (1 - interquartile_mean(values) / interquartile_mean(others))
 
 
+def _beside(simulated: Array, driven: Array) -> Estimate:
+    """Return the best score on the cart of an agent that is LIKE one in simulation which drops the pole."""
+    like = np.abs(simulated[:, None] - simulated) <= LIKE
+    return _exact(driven[(like & (driven < DROPPED)).any(axis=1)].max(initial=0), driven.size)
+
+
+def _contrast(*groups: Array) -> Estimate:
+    """Return by how much the first difference, of the first two groups, is larger than the second one."""
+    iqm = interquartile_mean
+    return bootstrap(lambda a, b, c, d: iqm(a) - iqm(b) - iqm(c) + iqm(d), *groups)
+
+
 def _wider(values: Array, others: Array) -> Estimate:
     return bootstrap(lambda a, b: a.std(axis=-1) - b.std(axis=-1), values, others)
 
@@ -169,6 +182,8 @@ STATISTICS: Mapping[str, tuple[str, Callable[..., Estimate]]] = {  # name: in wo
     "percent": ("", lambda whole, values: estimate(100 * values / whole)),
     "less": ("percent less", lambda values, others: bootstrap(_percent_less, values, others)),
     "difference": ("difference", difference),
+    "contrast": ("difference of the differences", _contrast),
+    "beside": ("the better has at most", _beside),
     "distance": ("difference", _nearer),
     "spread": ("difference", _wider),
 }
