@@ -34,6 +34,10 @@ UNKNOWN, TWICE = "with an empty cell or no finite number", "that repeat the row 
 SHORT, STANDING = "in a part that is too short", "in a part in which motor, cart or pole stand still"
 
 
+class NotALogError(RecordingError):
+    """A file without rows, or with none of the columns that the layout names."""
+
+
 class Report(NamedTuple):
     """The work done on one log."""
 
@@ -186,7 +190,7 @@ def read_columns(path: Path, layout: Layout) -> dict[str, Array]:
         if line.strip() and not line.lstrip().startswith(layout.comment)
     ]
     if len(numbered) < 3:
-        raise RecordingError(f"{path} holds no rows; give a log with a line of column names")
+        raise NotALogError(f"{path} holds no rows; give a log with a line of column names")
     delimiter = layout.delimiter or found_delimiter(numbered[0][1], layout.decimal)
     rows = [*csv.reader(io.StringIO("\n".join(line for _, line in numbered)), delimiter=delimiter)]
     heading = [name.strip() for name in rows[0]]
@@ -198,7 +202,8 @@ def read_columns(path: Path, layout: Layout) -> dict[str, Array]:
 def check_columns(path: Path, wanted: Sequence[str], present: Sequence[str]) -> None:
     """Raise RecordingError for a wanted column that is not present."""
     if missing := [name for name in wanted if name not in present]:
-        raise RecordingError(f"{path} has no column {', '.join(missing)}; it has {', '.join(present)}")
+        kind = NotALogError if len(missing) == len(wanted) else RecordingError
+        raise kind(f"{path} has no column {', '.join(missing)}; it has {', '.join(present)}")
 
 
 def read_npz(path: Path) -> Mapping[str, NDArray]:

@@ -18,12 +18,12 @@ from cartpole_rl.errors import RecordingError
 from cartpole_rl.evaluation.exchange import read_mcap, read_minari
 from cartpole_rl.evaluation.recordings import LENGTH, write_recording
 from cartpole_rl.identification.checks import motions
-from cartpole_rl.identification.logs import Log, Report, Rows, cut_log, read_rows
+from cartpole_rl.identification.logs import Log, NotALogError, Report, Rows, cut_log, read_rows
 from cartpole_rl.identification.sensors import Estimate, Sensors, question_sensors
 from cartpole_rl.identification.settings import ImportConfig, Layout, log_files
 from cartpole_rl.rig.hardware import nominal_hardware
 from cartpole_rl.run_folder import RECORDINGS, write_config, write_json
-from cartpole_rl.terminal import as_word, print_results, progress_bar, shown
+from cartpole_rl.terminal import as_word, print_message, print_results, progress_bar, shown
 from cartpole_rl.workflows.build import RECORDED
 from cartpole_rl.workflows.checks import exported_recordings
 
@@ -54,11 +54,18 @@ def import_logs(config: ImportConfig, folder: Path) -> Sensors | None:
         import_recordings(form, places, config, folder)
         return None
     paths = log_files(config)
-    rows = {}
+    rows, others = {}, []
     with progress_bar(len(paths), "logs") as bar:
         for path in paths:
-            rows[path] = read_rows(path, config.layout)
+            try:
+                rows[path] = read_rows(path, config.layout)
+            except NotALogError as error:  # such as the notes beside the logs
+                others.append(error)
             bar.update()
+    if not rows:
+        raise others[0]
+    for other in others:
+        print_message("import", f"note: left out: {other}")
     period = config.layout.period or common_period(rows, config.source)
     logs = {
         path: cut_log(read, config.layout, config.hardware.encoders, period) for path, read in rows.items()

@@ -413,6 +413,25 @@ def test_the_command_imports_what_identify_and_replay_take(tmp_path: Path, motio
     assert again.complaint.endswith("/run: it holds a run already; give another folder")
 
 
+def test_a_file_beside_the_logs_is_left_out(
+    tmp_path: Path, motion: Columns, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "logs"
+    folder.mkdir()
+    notes = folder / "notes.txt"
+    notes.write_text("on Monday\nthe cart was cold\nand the pole bent\n")
+    for source in (folder, notes):
+        with pytest.raises(RecordingError, match=r"notes\.txt has no column t, x, a, u; it has on, Monday"):
+            import_logs(imported(source), tmp_path / "run")
+    written(folder / "a.csv", motion)
+    import_logs(imported(folder), tmp_path / "run")
+    assert f"note: left out: {notes} has no column t, x, a, u" in capsys.readouterr().err
+    assert {path.name[:2] for path in (tmp_path / "run/recordings").iterdir()} == {"a_"}
+    written(folder / "b.csv", {"t": motion["t"], "x": motion["x"]})
+    with pytest.raises(RecordingError, match=r"b\.csv has no column a, u; it has t, x"):
+        import_logs(imported(folder), tmp_path / "more")
+
+
 def test_no_log_of_a_folder_replaces_another(tmp_path: Path, motion: Columns) -> None:
     (tmp_path / "logs").mkdir()
     for name in ("a.csv", "a.txt", "01_run.csv", "02_run.csv"):
