@@ -36,10 +36,9 @@ LEFT, RIGHT = 1, 2  # bits of end switches
 STALL_US = 500_000
 STALL_UM = 1000
 PUSH_US = 100_000  # of such pushes one way, after which the count must have changed
-SPEED_CHANGE = 200_000  # um/s, for one look; 0.2 m/s then turn any pole by two counts
-LOOK_US = (
-    62_000_000  # over the counts of a turn: 15 ms for 4096; one count of a pole as long as 1 m is 2 pi m
-)
+SPEED_CHANGE = 200_000  # um/s, for a look
+LOOK_US = 62_000_000  # over the counts of a turn: then such a change turns a pole of 1 m by two counts
+SHORTEST_US = 5000  # period, and look
 FASTEST_CART = 5_000_000_000  # nm/s; 5 m/s: over twice the motor's reach
 FASTEST_POLE = 16  # turns/s; five times a fast swing
 
@@ -132,7 +131,7 @@ class FrozenPoleWatch:
 
     def __init__(self, hardware: Hardware) -> None:
         self._nanometres = hardware.cart_nanometres_per_count
-        self._look_us = LOOK_US // hardware.pole_counts_per_turn
+        self._look_us = max(SHORTEST_US, LOOK_US // hardware.pole_counts_per_turn)
         self._change = max(SPEED_CHANGE, 4 * self._nanometres * 1000 // self._look_us)
         self._pole: int | None = None
         self._cart = 0  # its count when the present look began

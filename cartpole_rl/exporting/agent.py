@@ -196,7 +196,8 @@ class ExportedAgent:
         The description is JSON with sorted keys, without spaces, in ASCII. Each array is its name and shape
         as text, as in "layer0.bias [128]", and its float32 numbers, row by row, little-endian.
         """
-        return self._digest(self.description.model_dump(mode="json"))
+        unknown = () if self.description.hardware else ("hardware",)  # of files of earlier versions
+        return self._digest(self.description.model_dump(mode="json", exclude={*unknown}))
 
     @property
     def identity(self) -> int:

@@ -24,6 +24,10 @@ HELD_OUT_LEAD = 0.2  # s of a held-out window that give its initial state
 IRREGULAR = 0.2  # share of the period that a frame may come early or late
 
 
+class NoWindowError(RecordingError):
+    """Every recording is too short, or its frames are lost too often."""
+
+
 class Windows(NamedTuple):
     """W windows of T periods, with the motor values of the H periods before them."""
 
@@ -89,8 +93,8 @@ def cut_windows(
     ]
     if not pieces:
         if all(episode.measured_steps < periods for episode in episodes):
-            raise RecordingError(f"no recording lasts {periods * period:g} s: record longer")
-        raise RecordingError(
+            raise NoWindowError(f"no recording lasts {periods * period:g} s: record longer")
+        raise NoWindowError(
             f"no recording holds {periods * period:g} s without a lost frame: record longer, check the cable"
         )
     chosen = np.unique(np.linspace(0, len(pieces) - 1, min(most, len(pieces))).round().astype(int))

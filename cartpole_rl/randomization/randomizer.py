@@ -191,7 +191,8 @@ def draw_start(count: int, start: StartSettings, generator: torch.Generator) -> 
     resting = torch.addcmul(*bounds(start, device, resting=True), unit)
     if start.centred_share > 0:
         centred = torch.rand((count, 1), generator=generator, device=device) < start.centred_share
-        resting[:, :1] = torch.where(centred, CENTRED * unit[:, :1], resting[:, :1])
+        near = min(CENTRED, start.position_spread) * unit[:, :1]
+        resting[:, :1] = torch.where(centred, near, resting[:, :1])
     return torch.where(rests, resting, state)
 
 

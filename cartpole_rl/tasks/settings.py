@@ -30,7 +30,7 @@ class ActionSettings(Settings):
         return self
 
 
-CENTRED = 0.01  # m: homing ends at least so near the middle
+CENTRED = 0.01  # m: about so near the middle does homing leave a cart
 
 
 class Start(StrEnum):

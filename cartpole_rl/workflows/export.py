@@ -83,12 +83,13 @@ def write_rig(config: ExportConfig, folder: Path, words: Sequence[str]) -> None:
     pole = config.pole or PoleSettings(**choice("pole/medium"))
     given = [word for word in words if word.startswith(chosen)]
     source = " ".join(given if config.cart else ["cart=ip02", *given])
-    numbers = completed({**(config.cart or {}), **pole.heaviest.model_dump()})
+    cart = config.cart or choice("cart/ip02")
+    numbers = completed({**cart, **pole.heaviest.model_dump()})
     if numbers["backdrivability"] == 0:
         raise ConfigError(
             "cart: our firmware drives a DC motor, not a stepper; drive this cart with plant=text"
         )
-    header = rig_header(hardware_of(config.cart or {}), source, lever_um(numbers))
+    header = rig_header(hardware_of(cart), source, lever_um(numbers))
     write_config(folder, "export", {**config.model_dump(mode="json"), "seed": None})
     write_text(folder / RIG_HEADER, header)
     print(f"{folder}/{RIG_HEADER} is written; build the firmware with RIG={(folder / RIG_HEADER).resolve()}")

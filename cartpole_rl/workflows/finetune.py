@@ -326,7 +326,7 @@ def save_newest(files: FinetuningFiles, tuned: TunedAgent) -> None:
 
 
 def compare(cart: FinetuningCart, tuned: TunedAgent, settings: CartPoleSettings) -> None:
-    """Keep the better policy, and write both and the results, and print these."""
+    """Keep the better policy; write both policies and the results, and print the results."""
     files, config, task = cart.files, cart.config, settings.task
     episodes = {stage: files.episodes(stage) for stage in Stage}
     summaries = {}

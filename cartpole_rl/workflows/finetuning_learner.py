@@ -16,7 +16,7 @@ from cartpole_rl.evaluation.driving_policy import Weights, as_weights
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.identification.fit import Fit, best_fit
 from cartpole_rl.identification.unknowns import LONGEST_LATENCY
-from cartpole_rl.identification.windows import cut_windows
+from cartpole_rl.identification.windows import NoWindowError, cut_windows
 from cartpole_rl.learning.agent import QAgent
 from cartpole_rl.learning.checkpoints import (
     AgentCheckpoint,
@@ -103,6 +103,7 @@ class CartLearner:
     loop: Finetuning
     carts: torch.Tensor  # [P, SAMPLES], drawn from the newest fit, or as in training
     recorded: list[Episode]  # evaluations first
+    is_fitted = True  # the simulator, to recordings of this cart
 
     def __init__(
         self,
@@ -122,13 +123,14 @@ class CartLearner:
     def start(self, recorded: Sequence[Episode], learned: int = 0) -> Scalars:
         """Fit the simulator to the `recorded` episodes and prepare learning; return the first curves.
 
-        The agent has learned from `learned` episodes already: the schedules continue there. Where no cart can
-        be fitted yet, as to episodes that are too short, carts are drawn as in training.
+        The agent has learned from `learned` episodes already: the schedules continue there. While every
+        episode is too short for a fit, carts are drawn as in training. Raises RecordingError.
         """
         try:
             fit, models = self.fit_simulator(recorded)
             self.carts = self.draw_carts(fit)
-        except RecordingError as error:
+        except NoWindowError as error:
+            self.is_fitted = False
             self.show(f"the simulator is not fitted yet, its carts are drawn as in training: {error}")
             models, random = self.candidates[0], torch.Generator().manual_seed(self.config.seed)
             self.carts = randomizer(self.training).draw(SAMPLES, random)
@@ -141,6 +143,7 @@ class CartLearner:
         """Continue from `snapshot`; `recorded` are the episodes that were learned from until then."""
         with whole_state(f"resume={self.config.resume}"):
             self.carts = snapshot["carts"]
+            self.is_fitted = snapshot.get("is_fitted", True)  # missing in earlier versions
             friction = CART_FRICTIONS.find(snapshot["cart_friction"])
             self.prepare(recorded, self.candidates[0]._replace(cart_friction=friction))
             self.loop.restore(snapshot)
@@ -148,7 +151,11 @@ class CartLearner:
     def snapshot(self) -> dict[str, Any]:
         """Return the state from which `restore` continues, to be saved at once."""
         (models,) = self.candidates
-        state = {"carts": self.carts, "cart_friction": str(models.cart_friction)}
+        state = {
+            "carts": self.carts,
+            "cart_friction": str(models.cart_friction),
+            "is_fitted": self.is_fitted,
+        }
         return {**self.loop.snapshot(), **state}
 
     def round(self) -> Scalars:
@@ -160,7 +167,8 @@ class CartLearner:
         self.recorded.append(episode)
         self.loop.add(self.transitions(episode))
         learned = len(self.recorded) - self.config.evaluation_episodes
-        if learned % self.config.finetuning.refit == 0 and learned < self.config.episodes:
+        is_due = learned % self.config.finetuning.refit == 0 or not self.is_fitted
+        if is_due and learned < self.config.episodes:
             self.refit()
 
     def refit(self) -> None:
@@ -172,8 +180,9 @@ class CartLearner:
             fit, _ = self.fit_simulator(self.recorded)
             self.carts = self.draw_carts(fit)
         except RecordingError as error:
-            self.show(f"the simulator keeps its earlier fit: {error}")
+            self.show(f"the simulator stays as it is: {error}")
             return
+        self.is_fitted = True
         self.loop.simulate(self.randomizer())
 
     def prepare(self, recorded: Sequence[Episode], models: Models) -> None:

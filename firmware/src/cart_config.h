@@ -4,6 +4,10 @@
 
 #include "cart_rig.h"
 
+#ifndef CART_POLE_LEVER_UM
+#error "an earlier cart_rig.h: write it again, cartpole-export format=firmware cart=mine.yaml pole=my_pole.yaml"
+#endif
+
 #ifndef CART_PENDING
 #define CART_PENDING 1 /* motor values that can wait for their latency; a board applies them on arrival */
 #endif

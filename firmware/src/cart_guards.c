@@ -8,8 +8,9 @@
 #define STALL_COUNTS CART_COUNTS(1000)
 #define PUSH_US 100000u        /* of hard pushes one way, after which the count must have changed */
 #define PUSH_SQUARE (2000LL * CART_NANOMETRES) /* us^2, of its beginning: until 2 m/s^2 move a cart by two counts */
-#define LOOK_US (62000000 / CART_POLE_COUNTS)  /* in it 0.2 m/s turn any pole by two counts; 15 ms for 4096 a turn */
-#define ROUNDING_UM_S (4 * CART_NANOMETRES * 1000LL / LOOK_US) /* um/s: four counts of the cart in a look */
+/* In a look 0.2 m/s turn a pole as long as 1 m by two counts: 15 ms for 4096 a turn. */
+#define LOOK_US (62000000 / CART_POLE_COUNTS > CART_SHORTEST_US ? 62000000 / CART_POLE_COUNTS : CART_SHORTEST_US)
+#define ROUNDING_UM_S (4000LL * CART_NANOMETRES / LOOK_US) /* um/s: four counts of the cart in a look */
 #define SPEED_CHANGE (ROUNDING_UM_S > 200000 ? ROUNDING_UM_S : 200000)
 #define FASTEST_CART (5000000000LL / CART_NANOMETRES) /* counts/s: 5 m/s */
 #define FASTEST_POLE (16LL * CART_POLE_COUNTS)        /* counts/s: 16 turns a second */

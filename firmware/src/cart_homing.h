@@ -3,8 +3,9 @@
    An end is a stop that holds the cart or, on a rig with end switches, the place where one is pressed. A side without
    a switch is then not visited: it is one span from the other.
 
-   One reading every 15 ms or more, on raw counts: in less, a coarse encoder tells no speed. It needs only rough numbers of the cart. The pole's zero is the middle of
-   its last small swing: friction in the bearing holds a stopped pole up to a count off the vertical. */
+   One reading every 15 ms or more, on raw counts: in less, a coarse encoder tells no speed. It needs only rough
+   numbers of the cart. The pole's zero is the middle of its last small swing: friction in the bearing holds a stopped
+   pole up to a count off the vertical. */
 #ifndef CART_HOMING_H
 #define CART_HOMING_H
 

@@ -8,6 +8,7 @@ import yaml
 from command_line import COARSE, in_process
 
 from cartpole_rl.choices import choice
+from cartpole_rl.emulator.c_firmware import firmware_folder
 from cartpole_rl.rig.hardware import HARDWARE
 
 RIG = {
@@ -75,6 +76,9 @@ def test_its_firmware_has_its_numbers(folder: Path) -> None:
     words = ("format=firmware", "cart=lab.yaml", "cart.track_span=0.5", "pole=large", "hydra.run.dir=longer")
     done = in_process("export", *words, folder=folder)
     assert (done.code, "give pole=" in done.out) == (0, False)
+    assert in_process("export", "format=firmware", "hydra.run.dir=ip02", folder=folder).code == 0
+    shipped = firmware_folder() / "src" / "cart_rig.h"
+    assert (folder / "ip02" / "cart_rig.h").read_text() == shipped.read_text()
     longer = (folder / "longer" / "cart_rig.h").read_text()
     assert "of cart=lab.yaml cart.track_span=0.5 pole=large." in longer
     small, large = (int(re.findall(r"CART_POLE_LEVER_UM (\d+)", each)[0]) for each in (header, longer))

@@ -158,6 +158,14 @@ def test_an_agent_comes_back(exported: ExportedAgent, file: Path) -> None:
     assert found.weights_file() == file.read_bytes()  # equal agents make equal files
 
 
+def test_a_file_from_before_it_had_the_rig_is_read(exported: ExportedAgent, tmp_path: Path) -> None:
+    about = exported.description.model_copy(update={"hardware": {}})
+    older = ExportedAgent(about, exported.layers)
+    assert older.checksum == older._digest(about.model_dump(mode="json", exclude={"hardware"}))
+    (tmp_path / "agent.npz").write_bytes(older.weights_file())
+    assert read_agent(tmp_path / "agent.npz").identity == exported.identity
+
+
 def test_the_description_defines_the_agent(file: Path) -> None:
     with np.load(file) as archive:
         about = json.loads(archive["agent.json"])

@@ -327,7 +327,7 @@ def test_a_refit_that_fails_keeps_the_earlier_fit(
     loose = [replace(each, counts=each.counts + jumps) for each in late.recorded]
     monkeypatch.setattr(late, "recorded", loose)
     late.refit()
-    assert "the simulator keeps its earlier fit: no cart moves as" in capsys.readouterr().err.splitlines()[-1]
+    assert "the simulator stays as it is: no cart moves as" in capsys.readouterr().err.splitlines()[-1]
     assert torch.equal(late.carts, carts)
     assert len(late.loop.buffer) == capacity
 
