@@ -385,6 +385,10 @@ class ExportConfig(Settings):
             if self.run is not None:
                 raise ValueError("run: format=firmware writes the numbers of a cart; leave it out")
             check_cart(self.cart or {})
+            if self.cart and self.cart.get("backdrivability") == 0:
+                raise ValueError(
+                    "cart: our firmware drives a DC motor, not a stepper; drive this cart with plant=text"
+                )
         elif self.cart is not None or self.pole is not None:
             name = "pole" if self.cart is None else "cart"
             raise ValueError(

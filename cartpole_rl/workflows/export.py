@@ -78,17 +78,13 @@ def write_recordings(config: ExportConfig, folder: Path) -> None:
 
 
 def write_rig(config: ExportConfig, folder: Path, words: Sequence[str]) -> None:
-    """Write cart_rig.h. Raises ConfigError for a stepper, and for a folder that already holds a run."""
+    """Write cart_rig.h. Raises ConfigError for a folder that already holds a run."""
     chosen = ("cart=", "cart.", "pole=", "pole.")
     pole = config.pole or PoleSettings(**choice("pole/medium"))
     given = [word for word in words if word.startswith(chosen)]
     source = " ".join(given if config.cart else ["cart=ip02", *given])
     cart = config.cart or choice("cart/ip02")
     numbers = completed({**cart, **pole.heaviest.model_dump()})
-    if numbers["backdrivability"] == 0:
-        raise ConfigError(
-            "cart: our firmware drives a DC motor, not a stepper; drive this cart with plant=text"
-        )
     header = rig_header(hardware_of(cart), source, lever_um(numbers))
     write_config(folder, "export", {**config.model_dump(mode="json"), "seed": None})
     write_text(folder / RIG_HEADER, header)

@@ -42,11 +42,7 @@ COMPLAINS = {  # command: words, exit code, part of the line on stderr
         ("format=firmware run=pretrained/medium", 2, "run: format=firmware writes the numbers of a cart"),
         ("run=pretrained/medium format=c cart=ip02", 2, "format=c exports an agent with its own cart"),
         ("run=pretrained/medium format=c pole=large", 2, "format=c exports an agent with its own pole"),
-        (
-            "format=firmware cart=stepper",
-            1,
-            "our firmware drives a DC motor, not a stepper; drive this cart with plant=text",
-        ),
+        ("format=firmware cart=stepper", 2, "our firmware drives a DC motor, not a stepper"),
     ],
     "distill": [
         ("run=nowhere", 1, "run=nowhere: there is no such file or folder"),
