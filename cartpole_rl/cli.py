@@ -168,7 +168,7 @@ VERBS: dict[str, Verb] = {
         "  format=onnx       agent.onnx, for an ONNX runtime\n"
         "  format=c          policy.h and policy.c, for a microcontroller\n"
         "  format=web        cart.html, a page where the agent drives a cart that you push\n"
-        "  format=firmware   cart_rig.h, the numbers of cart=, which its firmware is built with\n"
+        "  format=firmware   cart_rig.h, the numbers of cart= and pole=, which the firmware is built with\n"
         "  format=minari     recordings as a data set of Minari, for offline reinforcement learning\n"
         "  format=mcap       recordings as files that Foxglove opens",
         "exporting",

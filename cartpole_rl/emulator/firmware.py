@@ -15,7 +15,9 @@ from cartpole_rl.emulator.guards import (
     FASTEST_CART,
     FASTEST_POLE,
     LEVER,
+    LONGEST_US,
     SAMPLES,
+    SHORTEST_US,
     FrozenCartWatch,
     FrozenPoleWatch,
     JumpWatch,
@@ -57,7 +59,6 @@ BANNER = (
     b"ets Jul 29 2019 12:21:46\r\n\r\nrst:0x1 (POWERON_RESET),boot:0x13\r\ncart %d.%d.%d\r\n\x00" % FIRMWARE
 )
 PERIOD_US = 20_000
-SHORTEST_US, LONGEST_US = 5_000, 100_000
 WATCHDOG_PERIODS = 3  # after a state was measured, no motor value that answers it is in force any more
 KEPT_TICKS = WATCHDOG_PERIODS + 1
 LEASE_US = 500_000  # without an accepted frame, after which homing ends
@@ -136,6 +137,7 @@ class Firmware:
         self._limits = TrackLimits(hardware, lever_um, samples)
         self._limited = False  # the limits have changed the motor value since the newest tick
         self._homing: Generator[int, Reading, Zeros] | None = None
+        self._waited_us = 0  # since homing read the counts
         half_span = nearest_count(micrometres(hardware.track_span) // 2, hardware)
         self._zeros = Zeros(-half_span, half_span, hanging=0)
         self._pole_zero = 0  # raw count that is reported as 0

@@ -33,12 +33,12 @@ from collections.abc import Mapping
 from cartpole_rl.rig.hardware import Hardware
 
 LEFT, RIGHT = 1, 2  # bits of end switches
+SHORTEST_US, LONGEST_US = 5_000, 100_000  # control periods
 STALL_US = 500_000
 STALL_UM = 1000
 PUSH_US = 100_000  # of such pushes one way, after which the count must have changed
 SPEED_CHANGE = 200_000  # um/s, for a look
 LOOK_US = 62_000_000  # over the counts of a turn: then such a change turns a pole of 1 m by two counts
-SHORTEST_US = 5000  # period, and look
 FASTEST_CART = 5_000_000_000  # nm/s; 5 m/s: over twice the motor's reach
 FASTEST_POLE = 16  # turns/s; five times a fast swing
 
@@ -97,8 +97,8 @@ class FrozenCartWatch:
     """Detects a cart count that does not change under hard pushes in both directions.
 
     Under a push one way only, the cart itself may be held by a stop or an obstacle. An
-    obstacle on one side lets the cart move the other way, by at least one count. The beginning of a push does
-    not count, until 2 m/s^2 would have moved the cart by two counts: short pushes may move nothing.
+    obstacle on one side lets the cart move the other way, by at least one count. A push counts only from the
+    time at which 2 m/s^2 would have moved the cart by two counts: a shorter one may move nothing.
     """
 
     def __init__(self, hardware: Hardware) -> None:
@@ -106,7 +106,7 @@ class FrozenCartWatch:
         self._count: int | None = None
         self._direction = 0  # of the present push: 1, -1, or 0 for none
         self._lasts_us = 0  # its length up to the newest count, at most PUSH_US
-        self._square = 2000 * hardware.cart_nanometres_per_count  # us^2, of the beginning of a push
+        self._square = 2000 * hardware.cart_nanometres_per_count  # us^2, from which on a push counts
         self._pushed_us = {1: 0, -1: 0}  # in each direction since the count changed, at most PUSH_US
 
     def frozen(self, cart: int, motor: int, us: int) -> bool:

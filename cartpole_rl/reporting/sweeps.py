@@ -63,8 +63,9 @@ class Member:
     @property
     def source(self) -> str:
         """The agent that the run starts from, or the run itself."""
-        lost = not self.agent and self.run.agent
-        return lost or os.path.realpath((self.agent or self.run).folder)
+        if self.agent is None and self.run.agent:
+            return self.run.agent  # its run is gone, or there was none
+        return os.path.realpath((self.agent or self.run).folder)
 
     @property
     def versions(self) -> str:
@@ -295,15 +296,16 @@ def _agents(kept: Sequence[Kept], measure: str, curves: Mapping[Path, Mapping[st
     return [
         Agent(
             label,
-            (0, *seeds)[-1],
+            first.seed,
             ", ".join(member.run.folder.as_posix() for member in own.values()),
             {name: value for each, member in own.items() for name, value in _values(each, member, measure)},
-            curves[next(iter(own.values())).run.folder],
+            curves[first.run.folder],
             folders={each: member.run.folder.as_posix() for each, member in own.items()},
             seeds=seeds,
-            source=next(iter(own.values())).source,
+            source=first.source,
         )
         for (label, seeds), own in found.items()
+        for first in [next(iter(own.values()))]
     ]
 
 

@@ -12,6 +12,7 @@ from cartpole_rl.settings import Count, Finite, Fraction, NonNegative, Positive,
 from cartpole_rl.tasks.rewards import Reward
 
 Measure = Literal["score", "score_upright"]  # equations (6.2) and (6.1), as in metrics.json
+CENTRED = 0.01  # m: homing leaves a cart about so near the middle
 NO_ACTION = -1  # where an observation or action value is not finite: motor 0, and the episode ends
 
 MotorValue = Annotated[int, Field(ge=-LARGEST_MOTOR, le=LARGEST_MOTOR)]
@@ -28,9 +29,6 @@ class ActionSettings(Settings):
         if len(set(self.motors)) != len(self.motors) or len(self.motors) < 2:
             raise ValueError(f"motors {list(self.motors)} must be two or more different values")
         return self
-
-
-CENTRED = 0.01  # m: about so near the middle does homing leave a cart
 
 
 class Start(StrEnum):

@@ -16,6 +16,7 @@ from typing import Any
 from torch import nn
 
 from cartpole_rl.checking import validated
+from cartpole_rl.composition import key_of
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.settings import CartPoleSettings
 from cartpole_rl.errors import CheckpointError, ConfigError
@@ -175,7 +176,7 @@ def overlaid(recorded: Mapping[str, Any], given: Mapping[str, Any], words: Seque
     """
     values = {**recorded, "resume": given["resume"]}
     for word in words:
-        group, _, name = word.lstrip("+~").partition("=")[0].partition(".")
+        group, _, name = key_of(word).partition(".")
         if name:
             values[group] = {**values[group], name: given[group][name]}
         elif word != f"learner={values.get('learner', {}).get('kind')}":

@@ -21,8 +21,8 @@ from operator import index
 from statistics import mean, median
 from threading import Lock, Thread
 
-from cartpole_rl.emulator.firmware import LARGEST_MOTOR, LONGEST_US, SHORTEST_US, Firmware
-from cartpole_rl.emulator.guards import FASTEST_CART, FASTEST_POLE
+from cartpole_rl.emulator.firmware import LARGEST_MOTOR, Firmware
+from cartpole_rl.emulator.guards import FASTEST_CART, FASTEST_POLE, LONGEST_US, SHORTEST_US
 from cartpole_rl.emulator.homing import Homing, HomingError, Reading, Window, Zeros, find_hanging
 from cartpole_rl.emulator.link import Channel
 from cartpole_rl.errors import CartPoleError, ConfigError, LinkError
