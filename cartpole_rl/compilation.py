@@ -9,7 +9,8 @@ those checks. If it is removed, replace it here with `torch.compile` and the `gu
 `torch.compiler.skip_all_guards_unsafe`.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from itertools import chain, islice
 from types import BuiltinFunctionType
 from typing import Any, Generic, Literal, NamedTuple, TypeVar
@@ -162,12 +163,27 @@ class LossGradient:
         leaves = [weight.detach().requires_grad_() for weight in trainable]
         state = TensorDict(dict(zip((*self._trainable, *self._fixed), (*leaves, *fixed), strict=True)))
         batch = TensorDict(dict(zip(self.keys, columns, strict=False)), batch_size=columns[0].shape[:1])
-        with state.to_module(self.loss, preserve_module_state=False), torch.enable_grad():
+        with acting_with(state, self.loss), torch.enable_grad():
             loss = self.loss(batch)["loss"]
             gradients = torch.autograd.grad(loss, leaves)
         norm = torch.stack([gradient.square().sum() for gradient in gradients]).sum().sqrt()
         share = (self.max_norm / norm).clamp(max=1)
         return loss.detach(), norm, batch["td_error"], *(share * each for each in gradients)
+
+
+@contextmanager
+def acting_with(weights: TensorDictBase, module: nn.Module) -> Iterator[None]:
+    """Let `module` act with `weights`; at the end it has its own again.
+
+    With `to_module` alone, tensordict 0.14 raises a RuntimeError in place of a KeyboardInterrupt. With the
+    module's state preserved, tensors would become new parameters, constants to a tracer.
+    """
+    scope = weights.to_module(module, preserve_module_state=False)
+    scope.__enter__()
+    try:
+        yield
+    finally:
+        scope.__exit__(None, None, None)
 
 
 def copied(tensor: Tensor) -> Tensor:

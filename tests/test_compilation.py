@@ -5,8 +5,10 @@ from typing import NamedTuple
 
 import pytest
 import torch
+from tensordict import TensorDict
 
-from cartpole_rl.compilation import Compiled, Traced, as_byte
+from cartpole_rl.compilation import Compiled, Traced, acting_with, as_byte
+from cartpole_rl.exits import Terminated
 
 pytestmark = pytest.mark.skipif(shutil.which("g++") is None, reason="g++ is not installed: apt install g++")
 
@@ -67,3 +69,22 @@ def test_flags_become_bytes() -> None:
     flags = torch.tensor([True, False])
     assert torch.equal(as_byte(flags), torch.tensor([1, 0], dtype=torch.uint8))
     assert torch.equal(as_byte(flags).view(torch.bool), flags)
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), Terminated(15), ValueError("not finite")])
+def test_what_ends_a_module_with_other_weights_comes_out_and_leaves_it_with_its_own(
+    error: BaseException,
+) -> None:
+    module = torch.nn.Linear(2, 1)
+    own = dict(module.named_parameters())
+    weights = TensorDict.from_module(module).data.clone().zero_()
+
+    def act() -> None:
+        with acting_with(weights, module):
+            assert module(torch.ones(2)).item() == 0
+            raise error
+
+    with pytest.raises(type(error)) as raised:
+        act()
+    assert raised.value is error
+    assert all(value is own[name] for name, value in module.named_parameters())

@@ -17,7 +17,7 @@ from torch import Tensor
 from torchrl.objectives import DQNLoss, ValueEstimators
 from torchrl.objectives.utils import dispatch_value_estimator, distance_loss
 
-from cartpole_rl.compilation import Columns, LossGradient
+from cartpole_rl.compilation import Columns, LossGradient, acting_with
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import LearningError
 from cartpole_rl.learning.replay import make_buffer
@@ -302,8 +302,7 @@ class AdvantageLearningLoss(DQNLoss):
         return TensorDict(loss=reduced)
 
     def _values(self, tensordict: TensorDictBase, weights: TensorDictBase) -> Tensor:
-        # with the module's state preserved, tensors would become new parameters, constants to a tracer
-        with weights.to_module(self.value_network, preserve_module_state=False):
+        with acting_with(weights, self.value_network):
             observed = tensordict.select(*self.value_network.in_keys)
             return self.value_network(observed)[self.tensor_keys.action_value]
 
