@@ -64,6 +64,16 @@ def claimed(folder: Path) -> Iterator[None]:
         os.close(descriptor)
 
 
+@contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Wait for the lock on the file `path`, which is made, and keep it; where there are no locks, go on."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w") as file:
+        with suppress(OSError, AttributeError):  # no locks, no `fcntl`
+            fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
 def write_text(path: Path, text: str) -> None:
     """Write `text` to `path` atomically, in UTF-8; bytes of file names that are none are escaped."""
     write_bytes(path, text.encode(errors="backslashreplace"))

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.registry import Extension, Registry
 from cartpole_rl.run_folder import MULTIRUN
+from cartpole_rl.terminal import print_message
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -59,10 +60,26 @@ LOGGERS.add("mlflow", "cartpole_rl.reporting.trackers:MlflowLog")
 
 
 class Loggers:
-    """Several loggers of one run; each method of `Logger` is that of each of them, in their order."""
+    """Several loggers of one run; each method of `Logger` is that of each of them, in their order.
+
+    A resumed run goes on without a logger that raises ConfigError, with a warning.
+    """
 
     def __init__(self, kinds: Sequence[Extension], folder: Path, purge_step: int | None = None) -> None:
-        self._each: list[Logger] = [kind(folder, purge_step) for kind in kinds]
+        self._each: list[Logger] = []
+        for kind in kinds:
+            try:
+                self._each.append(kind(folder, purge_step))
+            except ConfigError as error:
+                if purge_step is None:
+                    raise
+                print_message("train", f"warning: {error}; the run goes on without it")
+
+    def fail(self, error: BaseException) -> None:
+        """Call `fail` of the loggers that have it, before `close`: `error` ends the run."""
+        for logger in self._each:
+            if tell := getattr(logger, "fail", None):
+                tell(error)
 
     def __getattr__(self, name: str) -> Any:
         if name not in vars(Logger):

@@ -12,6 +12,7 @@ import os
 import tempfile
 import time
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +22,17 @@ from numpy.typing import ArrayLike
 from PIL import Image
 
 from cartpole_rl.errors import ConfigError, reason_of
+from cartpole_rl.files import locked
 from cartpole_rl.reporting.loggers import Logger, flatten, library, sweep_of
 from cartpole_rl.reporting.style import png
 from cartpole_rl.terminal import print_message
 
 PROJECT, AXIS = "cartpole_rl", "transitions"  # of wandb
-STORE, PICTURES, EXPERIMENT = "runs/mlflow.db", "runs/mlflow", "cartpole_rl"
-WANDB_RUN, MLFLOW_RUN = "wandb_run.txt", "mlflow_run.txt"  # in the run folder: the run of either
+SQLITE, STORE, PICTURES, EXPERIMENT = "sqlite:///", "runs/mlflow.db", "runs/mlflow", "cartpole_rl"
+WANDB_RUN, MLFLOW_RUN = (
+    "wandb_run.txt",
+    "mlflow_run.txt",
+)  # in the run folder: its run; in MLflow's also the store
 PATIENCE = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1", "MLFLOW_HTTP_REQUEST_TIMEOUT": "10"}  # else minutes
 MOST = 100  # parameters that MLflow takes at once
 
@@ -53,6 +58,7 @@ class WandbLog(Logger):
         except self._wandb.errors.Error as error:
             raise ConfigError(f"logger=wandb: {reason_of(error)} Or set WANDB_MODE=offline") from None
         file.write_text(self._run.id)
+        self._exit_code = 0
         self._run.define_metric("*", step_metric=AXIS)
 
     def scalars(self, values: Mapping[str, float | None], step: int) -> None:
@@ -79,41 +85,62 @@ class WandbLog(Logger):
         self._run.config.update(flatten(config), allow_val_change=True)
         self._run.summary.update({f"summary/{name}": each for name, each in metrics.items()})
 
+    def fail(self, error: BaseException) -> None:
+        """Let the run end as crashed."""
+        self._exit_code = 1
+
     def close(self) -> None:
         """Send or write the rest."""
-        self._run.finish()
+        self._run.finish(self._exit_code)
 
 
 class MlflowLog(Logger):
     """A run of MLflow, which has no histograms and writes at once.
 
-    Raises ConfigError where the server does not answer.
+    Raises ConfigError where the server does not answer, or has not the run that is resumed. Jobs of a sweep
+    make a database one after the other.
     """
 
     def __init__(self, folder: Path, purge_step: int | None = None) -> None:
         for name, number in PATIENCE.items():
             os.environ.setdefault(name, number)
-        self._mlflow = library("mlflow")
+        self._mlflow, file = library("mlflow"), folder / MLFLOW_RUN
         logging.getLogger("mlflow").setLevel(logging.WARNING)  # not how it makes its tables
-        store, pictures = os.environ.get("MLFLOW_TRACKING_URI"), None
-        if store is None:
-            Path(STORE).parent.mkdir(exist_ok=True)
-            store, pictures = f"sqlite:///{STORE}", Path(PICTURES).resolve().as_uri()
-        name = os.environ.get("MLFLOW_EXPERIMENT_NAME", EXPERIMENT)
-        self._client, self._lost, file = self._mlflow.MlflowClient(store), False, folder / MLFLOW_RUN
+        known = file.read_text().splitlines() if purge_step is not None and file.exists() else []
+        run, recorded, *_ = *known, "", ""
+        store = os.environ.get("MLFLOW_TRACKING_URI") or recorded or f"{SQLITE}{STORE}"
+        database = Path(store.removeprefix(SQLITE)) if store.startswith(SQLITE) else None
         try:
-            if purge_step is not None and file.exists():
-                self._run = file.read_text()
-                self._client.update_run(self._run, status="RUNNING")
-                return
-            found = self._client.get_experiment_by_name(name)
-            experiment = found.experiment_id if found else self._client.create_experiment(name, pictures)
-            tags = {"sweep": sweep} if (sweep := sweep_of(folder)) else {}
-            created = self._client.create_run(experiment, run_name=folder.name, tags=tags)
-        except self._mlflow.MlflowException as error:
+            with locked(database.with_suffix(".lock")) if database else nullcontext():
+                self._client = self._mlflow.MlflowClient(store)
+                if run:
+                    self._client.update_run(run, status="RUNNING")
+                else:
+                    tags = {"sweep": sweep} if (sweep := sweep_of(folder)) else {}
+                    created = self._client.create_run(self._experiment(), run_name=folder.name, tags=tags)
+                    run = created.info.run_id
+        except Exception as error:  # of MLflow, SQLAlchemy or Alembic
             raise ConfigError(f"logger=mlflow, {store}: {reason_of(error)}") from None
-        self._run = created.info.run_id
-        file.write_text(self._run)
+        self._run, self._lost, self._status = run, False, "FINISHED"
+        if database:
+            store = f"{SQLITE}{database.absolute().as_posix()}"
+        elif "@" in store:  # after a password
+            store = ""
+        file.write_text(f"{run}\n{store}\n")
+
+    def _experiment(self) -> str:
+        """Return the id of the experiment, which is made if it is missing."""
+        name = os.environ.get("MLFLOW_EXPERIMENT_NAME", EXPERIMENT)
+        pictures = None if os.environ.get("MLFLOW_TRACKING_URI") else Path(PICTURES).resolve().as_uri()
+        found = self._client.get_experiment_by_name(name)
+        if found is None:
+            try:
+                return str(self._client.create_experiment(name, pictures))
+            except self._mlflow.MlflowException:  # another job has made it meanwhile
+                found = self._client.get_experiment_by_name(name)
+                if found is None:
+                    raise
+        return str(found.experiment_id)
 
     def scalars(self, values: Mapping[str, float | None], step: int) -> None:
         """Log one point of each curve; None is no point."""
@@ -141,9 +168,13 @@ class MlflowLog(Logger):
             self._send(self._client.log_batch, params=settings[first : first + MOST])
         self.scalars({f"summary/{name}": each for name, each in metrics.items()}, 0)
 
+    def fail(self, error: BaseException) -> None:
+        """Let the run end as failed, or as killed by a signal."""
+        self._status = "FAILED" if isinstance(error, Exception) else "KILLED"
+
     def close(self) -> None:
         """End the run."""
-        self._send(self._client.set_terminated)
+        self._send(self._client.set_terminated, self._status)
 
     def _send(self, method: Callable[..., object], *arguments: Any, **named: Any) -> None:
         """Call a method of the client for this run; a lost server is warned of once, and ends no training."""

@@ -54,8 +54,10 @@ class TrainingMonitor(Monitor):
     def __enter__(self) -> "TrainingMonitor":
         return self
 
-    def __exit__(self, *error: object) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         self._bar.close()
+        if error is not None:
+            self._log.fail(error)
         self._log.close()
 
     def on_update(self, transitions: int, scalars: Scalars) -> None:

@@ -1,10 +1,15 @@
 """A training logs to several places at once; Weights & Biases and MLflow are read back from their files."""
 
 import json
+import re
+import shutil
 import struct
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import suppress
 from importlib.util import find_spec
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +17,12 @@ import pytest
 from command_line import in_process
 from toy_settings import TOY
 
-from cartpole_rl.errors import ConfigError
-from cartpole_rl.reporting.loggers import LOGGERS
+from cartpole_rl.errors import ConfigError, LearningError
+from cartpole_rl.exits import Terminated
+from cartpole_rl.reporting.loggers import LOGGERS, Loggers
 from cartpole_rl.reporting.tensorboard import scalars
 from cartpole_rl.workflows.config import TrainConfig, load_settings
+from cartpole_rl.workflows.monitor import TrainingMonitor
 from cartpole_rl.workflows.train import train
 
 SHORT = {**TOY[TrainConfig], "task.time_limit": 50, "learning.evaluations": 2}
@@ -54,7 +61,8 @@ def test_mlflow_stands_beside_tensorboard_and_groups_a_sweep(
     mlflow = pytest.importorskip("mlflow", reason="it is an extra")
     assert scalars(run, "evaluation/score") == points
     client = mlflow.MlflowClient("sqlite:///runs/mlflow.db")
-    identity = (run / "mlflow_run.txt").read_text()
+    identity, store = (run / "mlflow_run.txt").read_text().splitlines()
+    assert store == f"sqlite:///{Path('runs/mlflow.db').absolute()}"
     logged = client.get_run(identity)
     assert logged.info.status == "FINISHED"
     assert (logged.info.run_name, logged.data.tags["sweep"]) == ("first", run.parent.name)
@@ -63,10 +71,56 @@ def test_mlflow_stands_beside_tensorboard_and_groups_a_sweep(
     assert [(each.step, each.value) for each in history] == points
     pictures = {Path(each.path).suffix for each in client.list_artifacts(identity, "pictures")}
     assert {".png", ".gif"} <= pictures
-    again = LOGGERS.find("mlflow")(run, 1)  # as a resumed run
-    again.scalars({"later": 1.0, "nothing": None}, 5000)
-    again.close()
-    assert client.get_run(identity).data.metrics["later"] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("error", "status"),
+    [(None, "FINISHED"), (LearningError("diverged"), "FAILED"), (Terminated(15), "KILLED")],
+)
+def test_a_run_that_resumes_elsewhere_goes_on_in_mlflow_and_ends_as_the_training_does(
+    error: BaseException | None, status: str, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mlflow = pytest.importorskip("mlflow", reason="it is an extra")
+    identity, store = (run / "mlflow_run.txt").read_text().splitlines()
+    monkeypatch.chdir(tmp_path)
+    config = load_settings(TrainConfig, {**SHORT, "logger": "mlflow"})
+    resumed = TrainingMonitor(shutil.copytree(run, tmp_path / "run"), config, resumed_at=2048)
+    with suppress(LearningError, Terminated), resumed:
+        resumed.on_update(5000, {"later": 1.0})
+        if error:
+            raise error
+    found = mlflow.MlflowClient(store).get_run(identity)
+    assert (found.data.metrics["later"], found.info.status) == (1.0, status)
+    assert not Path("runs").exists()
+
+
+def test_a_run_resumes_without_a_tracker_that_lost_it(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("mlflow", reason="it is an extra")
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", (run / "mlflow_run.txt").read_text().splitlines()[1])
+    (tmp_path / "mlflow_run.txt").write_text("0123")
+    Loggers((LOGGERS.find("mlflow"),), tmp_path, 1).scalars({"later": 1.0}, 5000)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert re.search("warning: logger=mlflow, sqlite:.*0123.*; the run goes on without it", line)
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", "nowhere://a")
+    with pytest.raises(ConfigError, match="logger=mlflow, nowhere://"):
+        Loggers((LOGGERS.find("mlflow"),), tmp_path)
+
+
+def log_a_point(folder: Path) -> None:
+    log = LOGGERS.find("mlflow")(folder)
+    log.scalars({"score": 1.0}, 1)
+    log.close()
+
+
+def test_jobs_that_start_at_once_make_one_database_of_mlflow(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("mlflow", reason="it is an extra")
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{tmp_path}/mlflow.db")
+    with ProcessPoolExecutor(2, get_context("fork")) as pool:  # mlflow is imported already
+        list(pool.map(log_a_point, [tmp_path, tmp_path]))
 
 
 def test_a_lost_server_of_mlflow_ends_no_training(
@@ -116,6 +170,18 @@ def test_wandb_is_written_offline(run: Path, points: list[tuple[int, Any]]) -> N
     assert [(each["transitions"], each["evaluation/score"]) for each in scored] == points
     assert "video-file" in [each.get("pictures/cart/_type") for each in logged]
     assert settings["learning.batch_size"] == SHORT["learning.batch_size"]
+
+
+def test_a_failed_training_has_crashed_in_wandb(tmp_path: Path) -> None:
+    pytest.importorskip("wandb", reason="it is an extra")
+    from wandb.proto.wandb_internal_pb2 import Record
+
+    log = LOGGERS.find("wandb")(tmp_path)
+    log.fail(LearningError("diverged"))
+    log.close()
+    (file,) = tmp_path.glob("wandb/offline-run-*/*.wandb")
+    records = map(Record.FromString, stored(file.read_bytes()))
+    assert [each.exit.exit_code for each in records if each.HasField("exit")] == [1]
 
 
 @pytest.mark.parametrize("name", ["wandb", "mlflow"])
