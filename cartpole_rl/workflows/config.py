@@ -23,6 +23,7 @@ from cartpole_rl.envs.settings import (
 from cartpole_rl.errors import CheckpointError, ConfigError
 from cartpole_rl.identification.settings import EnsembleSettings
 from cartpole_rl.learning.settings import (
+    LONGEST_RETURN,
     BufferSettings,
     DistillationSettings,
     FinetuningSettings,
@@ -142,6 +143,18 @@ class TrainConfig(RunSettings, CartPoleSettings):
             raise ValueError(
                 f"learning.transitions={learning.transitions} is too few; give at least "
                 f"{learning.carts * learning.chunk * learning.evaluations}, or fewer evaluations"
+            )
+        if learning.collected_transitions <= (warmup := learning.warmup_transitions):
+            chunk = learning.carts * learning.chunk
+            raise ValueError(
+                f"learning.transitions={learning.transitions}: nothing would be learned, as the first "
+                f"{warmup} only fill the buffer (learning.warmup_transitions); give at least "
+                f"{(warmup // chunk + 1) * chunk}, or a shorter warm-up"
+            )
+        if learning.steps > LONGEST_RETURN:
+            raise ValueError(
+                f"learning.return_time={learning.return_time:g} s is {learning.steps} control periods; "
+                f"give at most {LONGEST_RETURN * self.control_period:g}, which is {LONGEST_RETURN}"
             )
         if self.buffer.size < learning.batch_size:
             raise ValueError(

@@ -35,6 +35,12 @@ WRONG_TRAINING = [
     ("+randomization.cart_masss={absolute:[1,2]}", "cart_masss", "did you mean 'cart_mass'?"),
     ("randomization.cart_mass.relative=[0.2,-0.2]", "randomization.cart_mass", "wrong order"),
     ("randomization=none +randomization.track_tilt={relative:[-1,1]}", "track_tilt", "give absolute bounds"),
+    (
+        "learning.transitions=20000 learning.evaluations=2",
+        "learning.transitions=20000: nothing would be learned",
+        "give at least 24576, or a shorter warm-up",
+    ),
+    ("learning.return_time=1", "learning.return_time=1 s is 50 control periods", "give at most 0.4"),
     ("learning.transitions=100", "learning: transitions=100 is too few", "or fewer evaluations"),
     ("agent.target_period=10", "agent", "either target_tau or target_period"),
     ("actions.motors=[100,100]", "actions", "two or more different values"),

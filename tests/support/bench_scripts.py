@@ -11,7 +11,8 @@ from types import ModuleType
 import pytest
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"
-TINY = ["learning.transitions=2048", "learning.carts=16", "learning.evaluations=2", "compile=false"]
+TINY = ["learning.transitions=2048", "learning.warmup_transitions=64", "learning.carts=16"]
+TINY += ["learning.evaluations=2", "compile=false"]
 Run = Callable[..., str]  # (script, folder, *words) -> output; the fixture `run`
 
 
