@@ -46,6 +46,7 @@ class TrainingCheckpoint:
     config: dict[str, Any]
     state: dict[str, Any]  # of `Training.snapshot` or `CartLearner.snapshot`
     step: int  # on the axis of TensorBoard: transitions of a training, episodes of a fine-tuning
+    drawn_from: dict[str, str] = field(default_factory=dict)  # SHA-256 of files that the carts come from
 
 
 Checkpoint = TypeVar("Checkpoint", AgentCheckpoint, TrainingCheckpoint)

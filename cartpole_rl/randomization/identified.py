@@ -104,6 +104,8 @@ def identified_carts(
         remedy = "copy it again, or run cartpole-identify from=<its run>"
         if settings.posterior.suffix == ".csv":
             remedy = "write names of parameters in its first line, and a number of each in every other one"
+        if isinstance(error, FileNotFoundError):
+            error, remedy = FileNotFoundError("there is no such file"), "put it back, or give another one"
         raise ConfigError(
             f"randomization.posterior={settings.posterior} cannot be read: {error}; {remedy}"
         ) from None

@@ -37,10 +37,12 @@ from cartpole_rl.physics.friction import CART_FRICTIONS
 from cartpole_rl.physics.laws import Law
 from cartpole_rl.plants.settings import (
     EmulatedSettings,
+    LearnedSettings,
     PlantSettings,
     PortSettings,
     SimulatedSettings,
     SimulationSettings,
+    find_model,
 )
 from cartpole_rl.randomization.poles import PoleSettings, check_one_pole
 from cartpole_rl.randomization.ranges import IdentifiedSettings
@@ -161,6 +163,22 @@ class TrainConfig(RunSettings, CartPoleSettings):
                 f"buffer.size {self.buffer.size} must be at least learning.batch_size {learning.batch_size}"
             )
         return self
+
+    def with_whole_paths(self) -> Self:
+        """Return the settings with absolute paths of `drawn_from`, for a resumption in another folder."""
+        plant, drawn = self.plant, self.randomization
+        if isinstance(plant, LearnedSettings):
+            plant = plant.model_copy(update={"model": plant.model.absolute()})
+        if isinstance(drawn, IdentifiedSettings):
+            drawn = drawn.model_copy(update={"posterior": drawn.posterior.absolute()})
+        return self.model_copy(update={"plant": plant, "randomization": drawn})
+
+    @property
+    def drawn_from(self) -> list[Path]:
+        """The files that the carts come from. Raises CheckpointError."""
+        model = [find_model(self.plant.model)] if isinstance(self.plant, LearnedSettings) else []
+        drawn = self.randomization
+        return [*model, drawn.posterior] if isinstance(drawn, IdentifiedSettings) else model
 
 
 class RepeatSettings(Settings):

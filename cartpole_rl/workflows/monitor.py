@@ -16,7 +16,7 @@ from cartpole_rl.reporting.animation import gif
 from cartpole_rl.reporting.episodes import behaviour, columns
 from cartpole_rl.reporting.loggers import Loggers
 from cartpole_rl.reporting.web_view import WebView
-from cartpole_rl.run_folder import BEST, CHECKPOINTS, HISTORY, LAST
+from cartpole_rl.run_folder import BEST, CHECKPOINTS, HISTORY, LAST, file_hash
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.terminal import print_message, progress_bar
 from cartpole_rl.workflows.config import TrainConfig
@@ -40,6 +40,7 @@ class TrainingMonitor(Monitor):
     ) -> None:
         self.folder, self.config, self._view = folder, config, view
         self._settings = config.model_dump(mode="json")
+        self._drawn_from = {str(path): file_hash(path) for path in config.drawn_from}
         self._logged = resumed_at or 0
         self._log = Loggers(config.logger, folder, None if resumed_at is None else resumed_at + 1)
         self._total = config.learning.at(config.control_period).collected_transitions
@@ -91,8 +92,8 @@ class TrainingMonitor(Monitor):
     def on_checkpoint(self, training: Training) -> None:
         """Write the state to resume from."""
         self._log.flush()
-        state = TrainingCheckpoint(self._settings, training.snapshot(), training.transitions)
-        save_training(self.folder, state)
+        state, step = training.snapshot(), training.transitions
+        save_training(self.folder, TrainingCheckpoint(self._settings, state, step, self._drawn_from))
 
     def randomization(self, plant: SimulatedPlant) -> None:
         """Log histograms of the current parameters of all carts."""

@@ -1,6 +1,6 @@
 """Train an agent in randomized simulation, from settings to a run folder."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
@@ -23,7 +23,7 @@ from cartpole_rl.reporting.episodes import report_episodes
 from cartpole_rl.reporting.randomization import drawn_carts
 from cartpole_rl.reporting.style import save
 from cartpole_rl.reporting.web_view import WebView
-from cartpole_rl.run_folder import BEST, CHECKPOINTS, FIGURES, METRICS, write_config
+from cartpole_rl.run_folder import BEST, CHECKPOINTS, FIGURES, METRICS, file_hash, write_config
 from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.terminal import as_word, print_message, print_results, shown, waiting
@@ -67,9 +67,12 @@ def train(config: TrainConfig, folder: Path) -> float | None:
         restore_weights(agent, checkpoint.state.get("agent", {}), f"resume={folder}")
     policy = DrivingPolicy(agent.greedy_policy(), config.compile)
     evaluate = partial(judge_agent, nominal_env(config), agent, policy, config.seed)
+    config = config.with_whole_paths()  # after the errors about them
     with claimed(folder):
         write_config(folder, "train", config.model_dump(mode="json"), resumed=checkpoint is not None)
         print_notes(config, env.plant.randomizer)
+        if checkpoint:
+            warn_of_changes(checkpoint.drawn_from)
         step = checkpoint.step if checkpoint else None
         with training_view(config, folder) as view, TrainingMonitor(folder, config, step, view) as monitor:
             settings = config.learning.at(config.control_period), config.buffer, config.optimizer
@@ -89,7 +92,7 @@ def train(config: TrainConfig, folder: Path) -> float | None:
     if fall := fall_note([evaluation[config.task.measure] for evaluation in monitor.history]):
         print(fall)
     identified = config.randomization
-    source = identified.posterior.parent if isinstance(identified, IdentifiedSettings) else None
+    source = shown(identified.posterior.parent) if isinstance(identified, IdentifiedSettings) else None
     cart = (source and words_of_run(source)) or emulated_words([config.pole])
     following = f"cartpole-evaluate {as_word('run', shown(folder))} {cart}"
     print_results(folder, f"{METRICS}, {FIGURES}/ and {CHECKPOINTS}/", following)
@@ -146,6 +149,15 @@ def print_notes(config: TrainConfig, draws: Draws) -> None:
     note_other_carts(config)
     if config.guard.active:
         print_message("train", f"track guard: {config.guard.active}")
+
+
+def warn_of_changes(drawn_from: Mapping[str, str]) -> None:
+    """Warn of each file that the carts come from and that no longer has this SHA-256."""
+    for name, was in drawn_from.items():
+        if Path(name).is_file() and file_hash(Path(name)) != was:
+            print_message(
+                "train", f"warning: {name} has changed since: the training goes on with other carts"
+            )
 
 
 def note_unused_randomization(config: TrainConfig, draws: Draws) -> None:
