@@ -32,7 +32,7 @@ from cartpole_rl.exits import EXPECTED, OF_HYDRA, exit_with_message, one_line
 from cartpole_rl.files import write_text
 from cartpole_rl.run_folder import ERROR
 from cartpole_rl.settings import Settings
-from cartpole_rl.terminal import print_message
+from cartpole_rl.terminal import print_message, program
 
 MODES = {"-m", "--multirun", "-r", "--run", "-c", "--cfg", "-i", "--info", "-sc", "--shell-completion"}
 NOT_ENDED = "it was killed or interrupted, or is still running"
@@ -131,6 +131,10 @@ def check_jobs(config: DictConfig, schema: type[Settings]) -> None:
         composed = loader.load_sweep_config(config, list(job))
         with read_write(composed), open_dict(composed):
             del composed["hydra"]
+        if composed.get("resume") is not None:
+            raise ConfigError(
+                f"resume= continues one run; call {program(SweepStart.command)} once for each, without -m"
+            )
         validated(schema, as_mapping(composed))
 
 
