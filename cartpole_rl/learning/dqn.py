@@ -195,9 +195,10 @@ class Training(Resumable):
         """
         loss, norm, errors = self.gradient(batch)
         if not math.isfinite(loss.item() + norm.item()):
+            kept = "" if self.last_score is None else "earlier checkpoints are kept; "  # of evaluations
             raise LearningError(
                 f"learning diverged after {self.transitions} transitions: the loss is {loss.item():g}, its "
-                f"gradient's norm {norm.item():g}; earlier checkpoints are kept; try a smaller "
+                f"gradient's norm {norm.item():g}; {kept}try a smaller "
                 f"optimizer.learning_rate than {self.optimizer_settings.learning_rate:g}"
             )
         self.optimizer.step()

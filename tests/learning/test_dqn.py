@@ -171,9 +171,12 @@ def test_the_best_score_in_another_measure_is_forgotten(make_training: MakeTrain
         assert resumed.monitor.evaluations == [(0, measure == "score_upright")]
 
 
-@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+@pytest.mark.parametrize(
+    ("value", "evaluated", "remedy"),
+    [(float("nan"), False, "; try a smaller"), (float("inf"), True, "; earlier checkpoints are kept; try a")],
+)
 def test_learning_stops_at_the_first_loss_that_is_not_finite(
-    make_training: MakeTraining, value: float
+    make_training: MakeTraining, value: float, evaluated: bool, remedy: str
 ) -> None:
     """One spoilt reward in replay: the weights stay those of the update before."""
     training = make_training()
@@ -183,7 +186,9 @@ def test_learning_stops_at_the_first_loss_that_is_not_finite(
     sample = training.buffer.sample()
     sample["next", "reward"][0] = value
     training.sample = lambda: sample
-    with pytest.raises(LearningError, match=r"diverged after 320 transitions.*a smaller optimizer"):
+    if evaluated:
+        training.run_evaluation()
+    with pytest.raises(LearningError, match=rf"diverged after 320 transitions.* norm [^;]+{remedy}"):
         training.iterate()
     assert all(map(torch.equal, training.gradient.weights, before))
 
