@@ -60,7 +60,9 @@ def one_line(error: Exception, name: str, plants: Collection[str] = ()) -> str:
     if isinstance(error, OF_HYDRA):
         return error_message(error, name, sys.argv[1:], plants)
     if isinstance(error, OSError):
-        remedy = "; make room, or give hydra.run.dir= a folder on another disk" if error.errno in FULL else ""
+        remedy = "; make room" if error.errno in FULL else ""
+        if remedy and not any(word.startswith("resume=") for word in sys.argv):  # which keeps its folder
+            remedy += ", or give hydra.run.dir= a folder on another disk"
         return f"{error.filename or 'a file was not written'}: {error.strerror}{remedy}"
     first = reason_of(error)
     return first if isinstance(error, EXPECTED) else f"{type(error).__name__}: {first}"

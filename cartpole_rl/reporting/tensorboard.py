@@ -35,6 +35,7 @@ from tensorboard.compat.proto.summary_pb2 import (
 from tensorboard.compat.tensorflow_stub.pywrap_tensorflow import masked_crc32c
 from torch.utils.tensorboard import FileWriter, summary
 
+from cartpole_rl.files import replacing
 from cartpole_rl.reporting.loggers import flatten
 from cartpole_rl.reporting.style import png
 
@@ -202,12 +203,12 @@ def cut_back(folder: Path, first_step: int) -> None:
     Other records stay, up to one that a killed run or a power cut damaged. Files are replaced atomically.
     """
     for path in sorted(folder.glob("events.out.tfevents.*")):
-        copy = path.with_name(f"{path.name.replace('tfevents', 'rest')}.part")
-        with path.open("rb") as source, copy.open("wb") as target:
+        rest = path.with_name(path.name.replace("tfevents", "rest"))  # which TensorBoard does not read
+        with path.open("rb") as source, replacing(rest) as beside, beside.open("wb") as target:
             for record, event in _records(source):
                 if _is_kept(event, first_step):
                     target.write(record)
-        copy.replace(path)
+        rest.replace(path)
 
 
 def scalars(folder: Path, tag: str) -> list[tuple[int, float]]:

@@ -6,13 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from small_files import files_of_at_most
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.backend.event_processing.event_multiplexer import EventMultiplexer
 from tensorboard.plugins.hparams import metadata
 
 from cartpole_rl.reporting.animation import gif
 from cartpole_rl.reporting.episodes import behaviour
-from cartpole_rl.reporting.tensorboard import TensorBoardLog, scalars
+from cartpole_rl.reporting.tensorboard import TensorBoardLog, cut_back, scalars
 from cartpole_rl.tasks.episode import Episode
 
 
@@ -143,6 +144,16 @@ class TestResume:
         with TensorBoardLog(tmp_path, purge_step=2) as log:
             log.scalars({"a": 3.0}, 2)
         assert points(tmp_path, "a") == {1: 1.0, 2: 3.0}
+
+    def test_a_full_disk_leaves_the_log_as_it_was(self, tmp_path: Path) -> None:
+        with TensorBoardLog(tmp_path) as log:
+            log.histogram("h", range(10_000), 1)
+            log.scalars({"a": 1.0}, 2)
+        (path,) = tmp_path.iterdir()
+        before = path.read_bytes()
+        with files_of_at_most(100), pytest.raises(OSError, match="File too large"):
+            cut_back(tmp_path, 2)
+        assert [(each.name, each.read_bytes()) for each in tmp_path.iterdir()] == [(path.name, before)]
 
     def test_resuming_into_an_empty_folder_starts_a_new_log(self, tmp_path: Path) -> None:
         with TensorBoardLog(tmp_path / "new", purge_step=5) as log:
