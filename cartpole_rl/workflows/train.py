@@ -1,5 +1,6 @@
 """Train an agent in randomized simulation, from settings to a run folder."""
 
+import math
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
@@ -191,10 +192,13 @@ def note_other_carts(config: TrainConfig) -> None:
 
 
 def nominal_env(config: TrainConfig) -> CartPoleEnv:
-    """Return the environment of evaluations: the nominal cart with each pole in turn."""
+    """Return the environment of evaluations: the nominal cart with each pole in turn.
+
+    Each pole has the same number of carts, so their number is rounded up.
+    """
     poles = config.pole.each
     assert poles.choices is not None
-    carts = len(poles.choices) * max(1, config.learning.evaluation_episodes // len(poles.choices))
+    carts = len(poles.choices) * math.ceil(config.learning.evaluation_episodes / len(poles.choices))
     nominal = config.model_copy(update={"pole": poles, "randomization": {}})
     start = config.task.evaluation_start
     return simulated_env(nominal, config.plant.as_evaluated, carts, start, 0, config.compile)

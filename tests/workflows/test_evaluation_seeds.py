@@ -75,3 +75,9 @@ def test_the_seed_of_an_evaluation_is_no_trainings_and_no_other_evaluations() ->
     seeds = (0, 1, 10_000, NUM_SEEDS - 1)
     assert all(NUM_SEEDS <= evaluation_seed(seed) < 2**32 for seed in seeds)
     assert len({evaluation_seed(seed) for seed in seeds}) == len(seeds)
+
+
+@pytest.mark.parametrize(("episodes", "pole", "carts"), [(1, "both", 2), (5, "both", 6), (100, "range", 100)])
+def test_an_evaluation_has_no_fewer_episodes_than_are_asked_for(episodes: int, pole: str, carts: int) -> None:
+    settings = {"learning.evaluation_episodes": episodes, "pole": pole, "guard": "none"}
+    assert nominal_env(training(0, randomization="none", **settings)).batch_size == (carts,)
