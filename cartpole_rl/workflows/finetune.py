@@ -294,7 +294,7 @@ def wait_for_weights(
         for news in link.poll():
             if isinstance(news, Offer):
                 take(news, cart.files, tuned)
-            else:
+            elif news.learned > tuned.logged:  # a learner that outlived its session sends all of its news
                 cart.log_learning(news.scalars, news.learned)
         lacking = number - tuned.learned
         if lacking <= 0:

@@ -60,10 +60,11 @@ class TunedAgent:
         self.agent: QAgent = new_agent(training)
         self.agent.load_state_dict(start.weights)
         self.first_weights = self.weights
-        self.learned = 0
+        self.learned, self.logged = 0, -1  # episodes; up to `logged`, the run has the curves
         self.state: dict[str, Any] = {}
         if checkpoint and checkpoint.state:
             self.learned, self.state = checkpoint.step, checkpoint.state
+            self.logged = self.learned or -1
             restore_weights(self.agent, self.state.get("agent", {}), "the state to resume from")
 
     @property

@@ -180,6 +180,18 @@ def test_weights_that_arrived_are_kept_for_a_resumption(session: Session) -> Non
     assert all(np.array_equal(expected[name], each) for name, each in as_weights(resumed.agent).items())
 
 
+@pytest.mark.parametrize(("version", "curves"), [(0, [0, 1, 2, 3, 4]), (2, [3, 4])])
+def test_a_resumption_logs_no_curve_again(version: int, curves: list[int], session: Session) -> None:
+    """Its learner has waited, and sends all of its news to a session that has got none of them."""
+    session.files.save({"agent": session.tuned.agent.state_dict(), NAME: "run"}, version)
+    saved = load_training(session.files.folder, FINETUNING_FORMAT)
+    session.tuned = TunedAgent(TRAINING, session.tuned.start, saved)
+    for each in range(5):
+        session.offer(each)
+    session.tune(lambda count, looks: None)
+    assert session.cart.curves == curves
+
+
 class PipedLink(LearnerLink):
     """A link whose process is the test: `ends` are the pipe's at each start, `first` is sent at once."""
 
