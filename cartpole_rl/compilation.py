@@ -9,9 +9,11 @@ those checks. If it is removed, replace it here with `torch.compile` and the `gu
 `torch.compiler.skip_all_guards_unsafe`.
 """
 
+import traceback
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import chain, islice
+from pathlib import Path
 from types import BuiltinFunctionType
 from typing import Any, Generic, Literal, NamedTuple, TypeVar
 
@@ -23,7 +25,12 @@ from torch._ops import OpOverload
 from torch.fx import GraphModule
 from torch.fx.experimental.proxy_tensor import make_fx
 
+from cartpole_rl.errors import ConfigError
+
 OPTIONS = {"cpp.enable_floating_point_contract_flag": "fast"}  # fused multiply-add on the CPU; Triton has it
+
+BRANCHES = "data-dependent", "_local_scalar_dense"  # in PyTorch's errors about `if` of a tensor
+TORCH = Path(torch.__file__).parent
 
 Arguments = Sequence[tuple[Tensor, ...]]
 Columns = tuple[Tensor, ...]  # of a batch of transitions
@@ -57,9 +64,18 @@ def trace(
         kinds.extend((rebuild(value), [part.dtype for part in value]))
         return [store(part) for part in value]
 
-    graph = make_fx(flat, tracing_mode=mode, _allow_non_fake_inputs=True)(
-        *map(copied, chain.from_iterable(arguments))
-    )
+    inputs = [*map(copied, chain.from_iterable(arguments))]
+    try:
+        graph = make_fx(flat, tracing_mode=mode, _allow_non_fake_inputs=True)(*inputs)
+    except RuntimeError as error:
+        if not any(sign in str(error) for sign in BRANCHES):
+            raise
+        calls = traceback.extract_tb(error.__traceback__)
+        own = [call for call in calls if TORCH not in Path(call.filename).parents]
+        raise ConfigError(
+            f"{own[-1].filename}, line {own[-1].lineno}: a formula cannot branch on a number of the carts; "
+            "use torch.where(condition, one, other)"
+        ) from None
     graph.graph.eliminate_dead_code()
     graph.recompile()
     return Trace(graph, *kinds)

@@ -120,8 +120,11 @@ class Registry(Generic[Kind]):
         return [*{**self._entries, **dict.fromkeys(_entry_points(self.kind))}]
 
     def add(self, name: str, item: Any, **properties: Any) -> Kind:
-        """Register an object, or its place as "module:name". Raises ConfigError if it is refused."""
-        if name in self._entries:
+        """Register an object, or its place as "module:name". Raises ConfigError if it is refused.
+
+        An object of the same place replaces one: a module is run again after an error in it, or by reload.
+        """
+        if name in self._entries and not same_place(self._entries[name]._item, item):
             raise ConfigError(f"there is a {self.words} {name!r} already: choose another name")
         if self.check and not isinstance(item, str):
             try:
@@ -196,6 +199,17 @@ class Registry(Generic[Kind]):
         return found
 
 
+def of_module(item: Any) -> str | None:
+    """Return the name of the module in which an object was written; None for a place."""
+    return getattr(item, "__module__", None)
+
+
+def same_place(one: Any, other: Any) -> bool:
+    """Return whether two objects have the same module and name there."""
+    names = [getattr(each, "__qualname__", each) for each in (one, other)]
+    return of_module(one) == of_module(other) and names[0] == names[1]
+
+
 def _recall(home: str, kind: str, name: str) -> Extension:
     """Return an extension that was pickled."""
     import_module(home)
@@ -227,9 +241,12 @@ def _module(name: str) -> Any:
         sys.path.append(here)
     try:
         return import_module(name)
-    except ConfigError:  # an extension in it is refused
-        raise
     except (Exception, SystemExit) as error:
+        for registry in Registry.all.values():  # nothing of a module that is not whole
+            entries = registry._entries.items()
+            registry._entries = {key: each for key, each in entries if of_module(each._item) != name}
+        if isinstance(error, ConfigError):  # an extension in it is refused
+            raise
         if isinstance(error, ModuleNotFoundError) and name.startswith(str(error.name)):
             places = "it is looked for in the current folder, on PYTHONPATH and among installed packages"
             raise ConfigError(f"there is no module {error.name!r}; {places}") from None

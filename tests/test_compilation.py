@@ -8,6 +8,7 @@ import torch
 from tensordict import TensorDict
 
 from cartpole_rl.compilation import Compiled, Traced, acting_with, as_byte
+from cartpole_rl.errors import ConfigError
 from cartpole_rl.exits import Terminated
 
 pytestmark = pytest.mark.skipif(shutil.which("g++") is None, reason="g++ is not installed: apt install g++")
@@ -47,6 +48,15 @@ def test_it_computes_the_same_in_every_call(kind: type[Compiled[Moved]] | type[T
         for value, right in zip(result, expected, strict=True):
             assert value.dtype == right.dtype
             torch.testing.assert_close(value, right)
+
+
+@pytest.mark.parametrize("kind", [Compiled, Traced])
+def test_a_branch_on_a_number_is_refused_by_its_line(kind: type[Compiled] | type[Traced]) -> None:
+    def braked(speed: tuple[torch.Tensor]) -> tuple[torch.Tensor]:
+        return (-speed[0] if (speed[0] > 0.3).any() else speed[0],)
+
+    with pytest.raises(ConfigError, match=r"test_compilation\.py, line \d+: a formula cannot branch"):
+        kind(braked)((torch.rand(7),))
 
 
 def test_no_gradient_flows_through_it() -> None:

@@ -128,4 +128,17 @@ def test_the_others_are_refused_in_one_line(name: Any, message: str) -> None:
 
 def test_a_name_is_taken_once() -> None:
     with pytest.raises(ConfigError, match="there is a test law 'double' already"):
-        LAWS.add("double", double)
+        LAWS.add("double", is_short)
+
+
+def test_a_module_that_fails_once_can_be_imported_when_it_is_mended(tmp_path: Path) -> None:
+    """Also in the same process: what it registered before it failed is registered again."""
+    module = tmp_path / "own_laws.py"
+    right = module.read_text()
+    module.write_text(f"{right}undefined\n")
+    for _ in range(2):
+        with pytest.raises(ConfigError, match="NameError: name 'undefined' is not defined"):
+            LAWS.find("own_laws:triple")
+    module.write_text(right)
+    sys.modules.pop("own_laws", None)
+    assert LAWS.find("own_laws:triple")(4) == 12

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from gymnasium.error import ResetNeeded
 from gymnasium.utils import EzPickle
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
@@ -12,6 +13,7 @@ from tensordict import TensorDictBase
 
 from cartpole_rl.envs.gymnasium import METADATA, PERIOD, SCORES, Array, Carts, Randomization, checked_actions
 from cartpole_rl.envs.rendering import Picture, Renderer
+from cartpole_rl.errors import ConfigError
 
 
 class CartPoleVector(Carts, VectorEnv[Array, Array, Array], EzPickle):
@@ -42,12 +44,14 @@ class CartPoleVector(Carts, VectorEnv[Array, Array, Array], EzPickle):
         self.single_observation_space, self.single_action_space = self.spaces_of_one()
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._present: TensorDictBase
+        self._present: TensorDictBase | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
-        """Start an episode on each cart; one seed serves all."""
+        """Start an episode on each cart; one seed serves all. Raises ConfigError for several."""
+        if seed is not None and not isinstance(seed, int | np.integer):
+            raise ConfigError(f"seed={seed}: give one integer, which seeds all carts")
         super().reset(seed=seed)
         self.seed_plant(seed)
         self._present = self.env.reset()
@@ -58,6 +62,8 @@ class CartPoleVector(Carts, VectorEnv[Array, Array, Array], EzPickle):
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         """One control period of every cart. Raises ConfigError for an action that does not exist."""
+        if self._present is None:
+            raise ResetNeeded("call reset() before step()")
         chosen = checked_actions(actions, self.action_space, len(self.env.hardware.motors))
         self._present.set("action", torch.as_tensor(chosen))
         transition, self._present = self.env.step_and_maybe_reset(self._present)

@@ -22,7 +22,7 @@ from cartpole_rl.physics.models import Models, check_laws
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.settings import SimulatedSettings
 from cartpole_rl.plants.specs import Numbers, Plant, PlantOutput
-from cartpole_rl.randomization.randomizer import Draws, draw_start
+from cartpole_rl.randomization.randomizer import Draws, draw_start, within_track
 from cartpole_rl.rig.hardware import Encoders, Hardware
 from cartpole_rl.rig.parameters import PARAMETERS
 from cartpole_rl.scalar import Scalar, plain
@@ -263,7 +263,8 @@ class SimulatedPlant(Plant):
 
     def _draw_starts(self, count: int) -> Starts:
         table = self.randomizer.draw(count, self._generator)
-        motion = draw_start(count, self.start, self._generator).T
+        motion = draw_start(count, self.start, self._generator).T.clone()
+        motion[0] = within_track(motion[0], self.start, CartParameters(table).track_half_length)
         return Starts(table, motion, self._first_counts(table, motion))
 
     def _first_counts(self, table: Tensor, motion: Tensor) -> Tensor:

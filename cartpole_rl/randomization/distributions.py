@@ -37,6 +37,9 @@ class Distribution(Extension):
         self.positive = positive
         keywords = {each.name: each for each in signature(item).parameters.values() if each.kind == KEYWORD}
         self.listed = keywords.pop("values", None) is not None
+        for key, each in keywords.items():
+            if each.annotation is Parameter.empty:
+                raise ConfigError(f"{name}: give its keyword {key} a type, as in {key}: float")
         fields: Any = {
             key: (each.annotation, ... if each.default is Parameter.empty else each.default)
             for key, each in keywords.items()
@@ -86,7 +89,7 @@ def log_normal(
     low: "Tensor",
     high: "Tensor",
     *,
-    median: Positive | None = None,
+    median: Finite | None = None,
     sigma: Positive | None = None,
 ) -> "Tensor":
     """Normal in the logarithm, cut off at the bounds; `sigma` is the standard deviation there."""

@@ -22,7 +22,6 @@ from cartpole_rl.rig.parameters import PARAMETERS, check_names
 Array = NDArray[np.float64]
 # what NumPy raises for a file that is missing, cut off, changed or another one
 UNREADABLE = (OSError, ValueError, LookupError, TypeError, EOFError, RuntimeError, BadZipFile, zlib.error)
-LATENCY = CartParameters.names().index("latency")
 
 
 class IdentifiedCarts(Draws):
@@ -37,7 +36,7 @@ class IdentifiedCarts(Draws):
         table: Tensor,
         prior: Draws,
         prior_share: float,
-        longest_delay: float,
+        longest_latency: float,
         identified: Collection[str] | None = None,
     ) -> None:
         if not table.isfinite().all():
@@ -46,7 +45,7 @@ class IdentifiedCarts(Draws):
         self.table, self.prior, self.prior_share = table.to(prior.nominal), prior, prior_share
         flags = [identified is None or name in identified for name in CartParameters.names()]
         self._identified = torch.tensor(flags, device=self.table.device).unsqueeze(1)
-        self._longest_delay = longest_delay  # s, of this table and of any that may replace it
+        self._longest_latency = longest_latency  # s, of this table and of any that may replace it
         self.nominal = self.table.median(1).values
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
@@ -77,9 +76,12 @@ class IdentifiedCarts(Draws):
         from_prior = torch.rand(count, generator=generator, device=device) < prior_share
         return self.table[:, which], self._identified & ~from_prior
 
-    def longest_delay(self) -> float:
-        """Return the longest latency that a draw can have, jitter included, s."""
-        return max(self.prior.longest_delay(), self._longest_delay)
+    def highest(self, name: str) -> float:
+        """Return the highest value that a draw of `name`, a parameter of the cart, can have."""
+        found = float(self.table[CartParameters.names().index(name)].max())
+        if name == "latency":
+            found = max(found, self._longest_latency)
+        return max(self.prior.highest(name), found)
 
     def can_differ_from_zero(self, name: str) -> bool:
         """Return whether a draw of `name` can be anything but 0."""
@@ -110,15 +112,24 @@ def identified_carts(
             f"randomization.posterior={settings.posterior} cannot be read: {error}; {remedy}"
         ) from None
     if not poles.is_single or not is_about(poles.nominal, posterior):
+        if settings.posterior.suffix == ".csv" and (given := posterior.keys() & Pole.model_fields.keys()):
+            raise ConfigError(
+                f"randomization.posterior={settings.posterior} has {', '.join(sorted(given))} of another "
+                "pole than pole=: leave these columns out, or choose that pole"
+            )
         posterior = {name: values for name, values in posterior.items() if name not in Pole.model_fields}
         identified = [name for name in identified if name in posterior]
     rows = []
     for name, nominal in zip(CartParameters.names(), prior.nominal.tolist(), strict=True):
         values = posterior.get(name, np.array([nominal]))
         values = np.median(values) + settings.widen * (values - np.median(values))
-        rows.append(np.clip(values, *PARAMETERS[name].bound[:2]))
+        rows.append(np.clip(values, *(bound := PARAMETERS[name].bound)[:2]))
+        if not bound.holds(rows[-1].min()):
+            raise ConfigError(
+                f"randomization.widen={settings.widen:g} takes {name} to {values.min():g}; it must be {bound}"
+            )
     table = torch.from_numpy(np.stack(np.broadcast_arrays(*rows))).float()
-    return IdentifiedCarts(table, prior, settings.prior_share, float(table[LATENCY].max()), identified)
+    return IdentifiedCarts(table, prior, settings.prior_share, 0.0, identified)
 
 
 def read_posterior(path: Path) -> tuple[dict[str, Array], list[str]]:
@@ -155,6 +166,8 @@ def read_samples(path: Path) -> tuple[dict[str, Array], list[str]]:
 
 
 def is_about(pole: Pole, posterior: Mapping[str, Any]) -> bool:
-    """Return True where `pole` may be the pole of a posterior: by its length and its mass."""
-    mass, com = (float(np.median(posterior.get(name, np.nan))) for name in ("pole_mass", "pole_com"))
+    """Return True where `pole` may be the pole of a posterior: by its length and its mass, if it has them."""
+    mass, com = (
+        float(np.median(posterior.get(name, getattr(pole, name)))) for name in ("pole_mass", "pole_com")
+    )
     return pole.is_about(2 * com) and 1 / HEAVIER < mass / pole.pole_mass < HEAVIER

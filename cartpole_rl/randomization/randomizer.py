@@ -21,6 +21,8 @@ from cartpole_rl.randomization.ranges import Range, check_carts
 from cartpole_rl.tasks.settings import CENTRED, Start, StartSettings
 
 POLE_FIELDS = tuple(Pole.model_fields)
+TRIED = 1025  # shares at which a distribution is tried
+START_SHARE = 0.75  # of half the track: no start is farther from the middle
 
 
 class Draws(Protocol):
@@ -34,8 +36,12 @@ class Draws(Protocol):
     def ends(self, name: str, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Return a draw with `name` at the low end of its range, and the same with it at the high end."""
 
+    def highest(self, name: str) -> float:
+        """Return the highest value that a draw of `name`, a parameter of the cart, can have."""
+
     def longest_delay(self) -> float:
         """Return the longest latency that a draw can have, jitter included, s."""
+        return self.highest("latency") + self.highest("latency_jitter")
 
     def can_differ_from_zero(self, name: str) -> bool:
         """Return whether a draw of `name` can be anything but 0."""
@@ -89,16 +95,12 @@ class Randomizer(Draws):
         low[row], high[row] = self._low[row].to(low.dtype), self._high[row].to(low.dtype)
         return self._table(poles, low), self._table(poles, high)
 
-    def longest_delay(self) -> float:
-        """Return the longest latency that a draw can have, jitter included, s."""
-        longest = 0.0
-        for name in ("latency", "latency_jitter"):
-            line, nominal = self.ranges.get(name), self._nominal_of(name)
-            if line is None:
-                longest += nominal
-            else:
-                longest += line.limits()[1] * (nominal if line.scales_nominal else 1.0)
-        return longest
+    def highest(self, name: str) -> float:
+        """Return the highest value that a draw of `name`, a parameter of the cart, can have."""
+        line, nominal = self.ranges.get(name), self._nominal_of(name)
+        if line is None:
+            return nominal
+        return max(limit * (nominal if line.scales_nominal else 1.0) for limit in line.limits())
 
     def can_differ_from_zero(self, name: str) -> bool:
         """Return whether a draw of `name` can be anything but 0."""
@@ -142,11 +144,20 @@ class Randomizer(Draws):
         return torch.stack([torch.as_tensor(rods[name]) for name in POLE_FIELDS])
 
     def _check_distributions(self) -> None:
-        """Raise ConfigError for a distribution that leaves its bounds."""
-        shares = torch.tensor([0.0, 0.3, 1.0], device=self.nominal.device)
+        """Raise ConfigError for a distribution that fails or leaves its bounds."""
+        shares = torch.linspace(0, 1, TRIED, device=self.nominal.device)
         for line, rows in self._lines:
             low, high = self._low[rows], self._high[rows]
-            values = line.drawn(shares.expand(len(low), 3), low, high)
+            given = shares.expand(len(low), TRIED)
+            try:
+                values = line.drawn(given, low, high)
+            except Exception as error:
+                reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
+                raise ConfigError(f"the distribution {line.distribution} fails: {reason}") from None
+            if getattr(values, "shape", None) != given.shape:
+                raise ConfigError(
+                    f"the distribution {line.distribution} must give a value for each share, [R, N]"
+                )
             room = 1e-9 + 1e-4 * torch.maximum(low.abs(), high.abs())
             if not ((values >= low - room) & (values <= high + room)).all():
                 raise ConfigError(f"the distribution {line.distribution} leaves its bounds")
@@ -160,6 +171,11 @@ class Randomizer(Draws):
         for name, line in self.ranges.items():
             for other, value in line.correlation.items():
                 pair = names.index(name), names.index(other)
+                back = self.ranges[other].correlation.get(name, value)
+                if back != value:
+                    raise ConfigError(
+                        f"randomization: {name} and {other} have two correlations, {value:g} and {back:g}"
+                    )
                 matrix[pair] = matrix[pair[::-1]] = value
         if not any(line.correlation for line in self.ranges.values()):
             return None
@@ -178,6 +194,11 @@ class Randomizer(Draws):
 
     def _flags(self, values: list[bool]) -> Tensor:
         return torch.tensor(values, dtype=torch.bool, device=self.nominal.device).unsqueeze(1)
+
+
+def within_track(x: Tensor, start: StartSettings, track_half_length: Tensor) -> Tensor:
+    """Return positions of starts, m, moved closer to the middle on a track that is short for their spread."""
+    return x * (START_SHARE * track_half_length / start.position_spread).clamp(max=1)
 
 
 def draw_start(count: int, start: StartSettings, generator: torch.Generator) -> Tensor:

@@ -132,7 +132,7 @@ class Range(Settings):
         values = like.new_zeros(share.shape)
         for line, (start, stop) in zip(self.mixture, pairwise(edges), strict=True):
             part = ((share - start) / (stop - start)).clamp(0, 1)
-            low, high = like.new_tensor(line.limits()).unbind(0)
+            low, high = like.new_tensor(line.limits()).reshape(2, 1, 1).unbind(0)
             values = values.where(share < start, line.drawn(part, low, high).to(values.dtype))
         return values
 

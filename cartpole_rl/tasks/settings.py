@@ -43,7 +43,7 @@ class StartSettings(Settings):
     """The initial state of an episode, drawn uniformly within plus or minus each spread."""
 
     angle: Start
-    position_spread: NonNegative  # m, of the cart about the middle
+    position_spread: NonNegative  # m, of the cart about the middle; less on a short track
     angle_spread: NonNegative  # rad, about upright or hanging
     speed_spread: NonNegative  # m/s
     angular_speed_spread: NonNegative  # rad/s

@@ -184,6 +184,7 @@ def test_keyword_arguments_take_what_the_configuration_takes(make: Any) -> None:
     [
         ({"pole": "larg"}, "pole=larg: there is no such choice; did you mean large"),
         ({"period": 0.5}, "control_period=0.5: give at most 0.1 s"),
+        ({"period": "soon"}, "control_period=soon: give a number"),
         ({"cart": {"defaults": ["ip02"], "cart_mas": 1}}, "cart_mas: .* did you mean cart_mass"),
         ({"poles": "large"}, "poles: an environment has no such setting; did you mean pole"),
         ({"agent": "dqn"}, "agent: an environment has no such setting"),
@@ -192,6 +193,14 @@ def test_keyword_arguments_take_what_the_configuration_takes(make: Any) -> None:
 def test_keyword_arguments_are_checked_as_the_configuration(given: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         gymnasium.make("cartpole_rl/SwingUp-v0", **given)
+
+
+def test_many_carts_are_reset_first_and_take_one_seed() -> None:
+    envs = gymnasium.make_vec("cartpole_rl/SwingUp-v0", num_envs=2, vectorization_mode="vector_entry_point")
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        envs.step(np.zeros(2, int))
+    with pytest.raises(ConfigError, match=r"seed=\[1, 2\]: give one integer"):
+        envs.reset(seed=[1, 2])  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("action", [-1, 9, 2.0, True, [2]])

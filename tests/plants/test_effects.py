@@ -117,7 +117,7 @@ def test_identified_carts_report_only_drawn_parameters(ip02: dict[str, float], m
     found = others.nominal.unsqueeze(1).repeat(1, 5)
 
     def unread(prior_share: float, identified: list[str] | None) -> list[str]:
-        carts = IdentifiedCarts(found, others, prior_share, longest_delay=0.02, identified=identified)
+        carts = IdentifiedCarts(found, others, prior_share, longest_latency=0.02, identified=identified)
         return without_effect(carts, ranges, (-200, 0, 200), Models(), 0.02, nominal_encoders())
 
     assert unread(0.0, None) == ["cart_mass", "latency"]

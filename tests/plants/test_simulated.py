@@ -135,6 +135,19 @@ class TestDraws:
             a, b = (push(plant, 100)["counts"] for plant in carts.values())
         assert (a == b).all(1).tolist() == [True, False]
 
+    def test_starts_fit_on_the_track_that_is_drawn(self, make_plant: MakePlant) -> None:
+        """On a short one they are uniform over three quarters of it; a long one changes nothing."""
+        ranges = {"track_half_length": Range(absolute=(0.1, 0.5))}
+        plant = make_plant(20_000, ranges=ranges, start=ANYWHERE)
+        plant.reset()
+        track, place = plant.track_half_length, plant.true_state.x
+        spread = (0.75 * track).clamp(max=ANYWHERE.position_spread)
+        share = (place / spread + 1) / 2
+        for rows in (track < 0.2, track > 0.3):
+            values = share[rows].sort().values
+            assert (values - torch.linspace(0, 1, len(values))).abs().max() < 0.03
+        assert not push(plant, 0)["terminated"].any()
+
     def test_are_repeated_by_the_seed(self, make_plant: MakePlant) -> None:
         def course(seed: int) -> Tensor:
             plant = make_plant(4, ranges=NOISY, start=ANYWHERE, seed=seed)

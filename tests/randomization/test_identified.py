@@ -30,7 +30,7 @@ def heavy_carts(ip02: dict[str, float], medium: PoleSettings) -> Callable[..., I
         table[MASS] = torch.linspace(0.5, 1.0, 100)
         table[VISCOUS] = 2 * table[MASS]
         table[VISCOUS, 7] *= spoilt
-        return IdentifiedCarts(table, prior, prior_share, longest_delay=0.03)
+        return IdentifiedCarts(table, prior, prior_share, longest_latency=0.03)
 
     return build
 
@@ -114,6 +114,7 @@ def test_samples_of_a_file_stay_together_by_row(
         ("cart_mas\n0.5\n", "did you mean 'cart_mass'"),
         ("cart_mass\n0.5\n-1\n", "cart_mass is -1; it must be above 0"),
         ("cart_mass\nnan\n", "cart_mass is nan; it must be above 0"),
+        ("pole_com\n0.3\n", "has pole_com of another pole than pole=: leave these columns out"),
     ],
 )
 def test_samples_that_are_no_carts_are_refused(
@@ -122,6 +123,29 @@ def test_samples_that_are_no_carts_are_refused(
     with pytest.raises(ConfigError, match=reason) as raised:
         identified_carts(of_samples(tmp_path / "carts.csv", text), ip02, medium)
     assert "\n" not in str(raised.value)
+
+
+def test_a_pole_column_alone_is_drawn(ip02: dict[str, float], medium: PoleSettings, tmp_path: Path) -> None:
+    draws = identified_carts(of_samples(tmp_path / "carts.csv", "pole_mass\n0.12\n0.13\n"), ip02, medium)
+    drawn = CartParameters(draws.draw(100, torch.Generator().manual_seed(0))).pole_mass
+    assert {round(mass, 3) for mass in drawn.tolist()} == {0.12, 0.13}
+
+
+def test_a_cart_without_mass_is_not_drawn(
+    ip02: dict[str, float], medium: PoleSettings, tmp_path: Path
+) -> None:
+    settings = of_samples(tmp_path / "carts.csv", "cart_mass\n0.3\n0.7\n2\n")
+    with pytest.raises(ConfigError, match=r"widen=2 takes cart_mass to -0\.1; it must be above 0"):
+        identified_carts(settings.model_copy(update={"widen": 2.0}), ip02, medium)
+
+
+def test_the_longest_delay_is_that_of_a_cart_with_the_jitter_of_the_range(
+    ip02: dict[str, float], medium: PoleSettings, tmp_path: Path
+) -> None:
+    settings = of_samples(tmp_path / "carts.csv", "latency\n0.02\n0.01\n")
+    ranges = {"latency_jitter": Range(absolute=(0.0, 0.01))}
+    draws = identified_carts(settings.model_copy(update={"ranges": ranges}), ip02, medium)
+    assert draws.longest_delay() == pytest.approx(0.03)
 
 
 def saved(*arrays: object, **named: object) -> bytes:

@@ -41,6 +41,26 @@ def beyond(share: Tensor, low: Tensor, high: Tensor) -> Tensor:
     return low + 2 * share * (high - low)
 
 
+@DISTRIBUTIONS.register("bump")  # beyond its bounds between the shares that a few trials see
+def bump(share: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    return low + share * (high - low) + 100 * ((share > 0.5) & (share < 0.9))
+
+
+@DISTRIBUTIONS.register("failing")
+def failing(share: Tensor, low: Tensor) -> Tensor:
+    return low + share
+
+
+@DISTRIBUTIONS.register("flat")
+def flat(share: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    return low
+
+
+@DISTRIBUTIONS.register("first_column")  # as a user may write it: bounds are [R, 1]
+def first_column(share: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    return low[:, :1] + share * (high[:, :1] - low[:, :1])
+
+
 def draw(randomizer: Randomizer, seed: int = 0, count: int = COUNT) -> CartParameters:
     return CartParameters(randomizer.draw(count, torch.Generator().manual_seed(seed)))
 
@@ -227,6 +247,15 @@ NEEDS_NOMINAL = "relative and factor bounds need a nominal value"
         ({}, {"point": POINT}, "pole_inertia", TENTH, f"pole_inertia: {NEEDS_NOMINAL}"),  # for one pole
         ({}, {}, "latency", {"absolute": (0, 0.1), "distribution": "log_uniform"}, "needs bounds above 0"),
         ({}, {}, "latency", {"absolute": (0, 0.1), "distribution": "beyond"}, "beyond leaves its bounds"),
+        ({}, {}, "cart_mass", {**TENTH, "distribution": "bump"}, "bump leaves its bounds"),
+        ({}, {}, "cart_mass", {**TENTH, "distribution": "flat"}, "flat must give a value for each share"),
+        (
+            {},
+            {},
+            "cart_mass",
+            {**TENTH, "distribution": "failing"},
+            r"failing fails: TypeError: failing\(\) takes",
+        ),
     ],
 )
 def test_carts_that_cannot_be_drawn_are_refused(
@@ -315,6 +344,27 @@ class TestPoles:
 )
 def test_the_longest_delay(of: Of, lines: dict[str, Range], delay: float) -> None:
     assert of(lines, latency_jitter=0.002).longest_delay() == pytest.approx(delay)
+
+
+def test_lines_of_a_mixture_have_bounds_as_a_line_alone(of: Of, ip02: dict[str, float]) -> None:
+    line = Range(distribution="first_column", relative=(-0.1, 0.1))
+    drawn = draw(of({"cart_mass": Range(mixture=(line, line))})).cart_mass / ip02["cart_mass"]
+    assert farthest_from_uniform(((drawn - 0.9) / 0.2 * 2).remainder(1)) < 0.015
+
+
+def test_the_nominal_value_can_be_the_median(of: Of, ip02: dict[str, float]) -> None:
+    line = Range(distribution="log_normal", relative=(-0.3, 0.3), median=0.0)
+    assert draw(of({"cart_mass": line})).cart_mass.median().item() == pytest.approx(
+        ip02["cart_mass"], rel=0.02
+    )
+
+
+def test_a_keyword_without_a_type_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"untyped: give its keyword power a type, as in power: float"):
+
+        @DISTRIBUTIONS.register("untyped")
+        def untyped(share: Tensor, low: Tensor, high: Tensor, *, power=2.0) -> Tensor:  # type: ignore[no-untyped-def]
+            return low
 
 
 def test_what_needs_simulating(of: Of) -> None:
