@@ -144,10 +144,10 @@ def no_such_setting(key: str, known: Iterable[str]) -> str:
     if above == "parameters":
         return f"{key}: numbers of the cart are given together, as 'parameters={{{wrong}:...}}'"
 
-    def similar(setting: str) -> tuple[float, float]:
+    def similar(setting: str) -> tuple[float, float, bool]:
         place, _, name = setting.rpartition(".")
         ratio, letters = similarity(wrong, name)
-        return ratio + SAME_GROUP * (place == above), letters
+        return ratio + SAME_GROUP * (place == above), letters, place == "plant"  # rather than emulator
 
     nearest = max(sorted(known), key=similar, default="")
     near = bool(nearest) and similar(nearest)[0] > NEAR

@@ -139,8 +139,8 @@ VERBS: dict[str, Verb] = {
     "replay": Verb(
         "workflows.config:ReplayConfig",
         "workflows.replay:replay_recordings",
-        "drives the simulated cart with recorded motor values,\n"
-        "and shows how far it deviates from the recording.",
+        "compares the simulated cart with recordings.\n"
+        "Drives it with their motor values, and shows how far it deviates from them.",
         "identification",
         (
             "from=runs/record/2026-11-21_12-00-00",

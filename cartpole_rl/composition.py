@@ -56,7 +56,16 @@ from cartpole_rl.choices import (
 from cartpole_rl.errors import ConfigError, reason_of
 from cartpole_rl.rig.hardware import HARDWARE, hardware_of
 from cartpole_rl.rig.parameters import PARAMETERS, check_value, completed
-from cartpole_rl.run_folder import CONFIG, PREFIX, RUN_FILES, USES, check_program, program_of, use_of
+from cartpole_rl.run_folder import (
+    CONFIG,
+    PREFIX,
+    RUN_FILES,
+    USES,
+    check_program,
+    find_training,
+    program_of,
+    use_of,
+)
 from cartpole_rl.terminal import in_quotes
 
 WORD = re.compile(r"([a-z_]+)=(.+)", re.DOTALL)
@@ -239,6 +248,7 @@ class _OwnChoices:
         if runs is None or len(runs) > 1 or runs[0] is None:
             return []
         run = runs[0].text if isinstance(runs[0], QuotedString) else _text(runs[0])
+        find_training(Path(run))
         recorded = read_file("resume", Path(run) / CONFIG)
         self._put(f"{OWN}/resumed", "resumed", {group: recorded.get(group) for group in groups}, "_global_")
         return [f"+{OWN}/resumed=resumed"]

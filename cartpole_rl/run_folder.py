@@ -134,9 +134,24 @@ def use_of(folder: Path, program: str) -> str:
         return f"it was stopped before its first checkpoint; start {PREFIX}{program} again"
     if program == "distill" and not (folder / CHECKPOINTS / LAST).exists():
         return f"it was stopped before its end; start {PREFIX}{program} again"
+    if program == "identify" and not (folder / IDENTIFIED).exists():
+        return (
+            f"it was stopped before its end; {PREFIX}{program} {as_word('from', folder)} reads its recordings"
+        )
+    if program == "evaluate" and not repeatable(folder):
+        return f"its results are {METRICS} and {FIGURES}/"
     return USES[program].format(
         *map(as_value, (folder, folder / CART, folder / POLE, folder / RANDOMIZATION))
     )
+
+
+def repeatable(folder: Path) -> bool:
+    """Return whether an evaluation drove simulated carts, whose episodes can be driven again."""
+    try:
+        metrics = json.loads((folder / METRICS).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(metrics, dict) and metrics.get("plant") == "simulated"
 
 
 def has_ended(run: Path) -> bool:

@@ -15,6 +15,7 @@ from types import FrameType
 # does not answer takes up to 5.5 s: LONGEST_STOP, LAST_STOP and LONGEST_WRITE in `plants.serial`.
 UNWINDING = 6.0
 PARENT_POLL = 0.5  # s
+PARENT = "CARTPOLE_RL_PARENT"  # in the environment of a process that serves a cart: the one that started it
 
 
 def ending_signals() -> list[signal.Signals]:
@@ -58,6 +59,11 @@ class RaiseOnce:
         for number in numbers:
             if signal.getsignal(number) is self:
                 signal.signal(number, signal.SIG_IGN)
+
+
+def starting_process() -> int:
+    """Return the process that started this one, also if it has ended since: `PARENT` in the environment."""
+    return int(os.environ.pop(PARENT, "") or os.getppid())
 
 
 def end_with_parent(parent: int) -> None:

@@ -200,10 +200,11 @@ def words_given(*settings: str) -> list[str]:
     return [word for word in sys.argv[1:] if word.partition("=")[0] in settings]
 
 
-def print_results(folder: Path, files: str, following: str) -> None:
-    """Print that `files` are in `folder`, and the command `following`."""
-    print(f"{shown(folder)}/{files} are written; next:")
-    print(following)
+def print_results(folder: Path, files: str, following: str | None) -> None:
+    """Print that `files` are in `folder`, and the command `following`, if there is one."""
+    print(f"{shown(folder)}/{files} are written{'; next:' if following else ''}")
+    if following:
+        print(following)
 
 
 def print_loop_time(override: str | None) -> None:

@@ -5,7 +5,6 @@ status: 0 after SIGINT or SIGTERM, 2 for invalid settings, 1 if the cart cannot 
 """
 
 import argparse
-import os
 import sys
 
 from pydantic import ValidationError
@@ -13,12 +12,12 @@ from pydantic import ValidationError
 from cartpole_rl.emulator.process import run
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import CartPoleError, ConfigError
-from cartpole_rl.signals import end_with_parent
+from cartpole_rl.signals import end_with_parent, starting_process
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run an emulated cart until it is interrupted; return the exit status."""
-    parent = os.getppid()
+    parent = starting_process()
     parser = argparse.ArgumentParser(
         prog="python -m cartpole_rl.emulator",
         description="Emulate a cart on a pseudo-terminal or a TCP port. Prints its port as one JSON line.",

@@ -18,6 +18,7 @@ from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import CartPoleError, ConfigError, EmulatorError, LinkError
 from cartpole_rl.plants.settings import LONGEST_WRITE, BoardSettings, SerialSettings
 from cartpole_rl.rig.hardware import Hardware
+from cartpole_rl.signals import PARENT
 
 READY_TIMEOUT = 60.0  # s for the first line; the process loads MuJoCo before it
 ENDING = 1.0  # s that a process whose port is gone may still need
@@ -44,6 +45,7 @@ class CartProcess:
             stdout=subprocess.PIPE,
             stderr=self._stderr,
             start_new_session=True,
+            env={**os.environ, PARENT: str(os.getpid())},
             creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),  # the same on Windows
         )
         try:

@@ -17,7 +17,7 @@ from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.randomization.poles import HEAVIER, Pole, PoleSettings
 from cartpole_rl.randomization.randomizer import Draws, Randomizer
 from cartpole_rl.randomization.ranges import IdentifiedSettings
-from cartpole_rl.rig.parameters import PARAMETERS, check_names
+from cartpole_rl.rig.parameters import PARAMETERS, Bound, check_names
 
 Array = NDArray[np.float64]
 # what NumPy raises for a file that is missing, cut off, changed or another one
@@ -122,14 +122,20 @@ def identified_carts(
     rows = []
     for name, nominal in zip(CartParameters.names(), prior.nominal.tolist(), strict=True):
         values = posterior.get(name, np.array([nominal]))
-        values = np.median(values) + settings.widen * (values - np.median(values))
-        rows.append(np.clip(values, *(bound := PARAMETERS[name].bound)[:2]))
-        if not bound.holds(rows[-1].min()):
-            raise ConfigError(
-                f"randomization.widen={settings.widen:g} takes {name} to {values.min():g}; it must be {bound}"
-            )
+        rows.append(widened(values, settings.widen, PARAMETERS[name].bound))
     table = torch.from_numpy(np.stack(np.broadcast_arrays(*rows))).float()
     return IdentifiedCarts(table, prior, settings.prior_share, 0.0, identified)
+
+
+def widened(values: Array, factor: float, bound: Bound) -> Array:
+    """Return values [M] `factor` times as far from their median, within the bound.
+
+    Distances are those of logarithms where the parameter must be above 0.
+    """
+    median = np.median(values)
+    if bound.low == 0 and not bound.low_allowed:
+        return np.minimum(median * (values / median) ** factor, bound.high)
+    return np.clip(median + factor * (values - median), bound.low, bound.high)
 
 
 def read_posterior(path: Path) -> tuple[dict[str, Array], list[str]]:

@@ -47,7 +47,8 @@ def report_episodes(
 ) -> dict[str, Any]:
     """Write figures/ and metrics.json into `folder`, and return the summary of the episodes (`summarize`).
 
-    metrics.json is written last: a run that has it is complete.
+    metrics.json is written last: a run that has it is complete. If a figure cannot be written, it is written
+    all the same, and OSError is raised.
     Behaviour figure and animation show the first episode; `mp4` adds the animation as an MP4. `history` adds
     the learning curve, `onboard` the episodes that the cart's board drove, under that key of metrics.json and
     of the summary.
@@ -58,16 +59,21 @@ def report_episodes(
     cart, origins = stored_origins(episodes)
     listed = [{**each, **origin} for each, origin in zip(listed, origins, strict=True)]
     content = {**header, **summary, **cart, "episodes": listed}
-    figures = folder / FIGURES
+    figures, failed = folder / FIGURES, None
     if onboard:
         summary["onboard"], listed = summarized(onboard, x_max)
         content["onboard"] = {**summary["onboard"], "episodes": listed}
-        draw(onboard[0], figures, "onboard_", f"plant={plant}, on the board", pole, x_max, mp4)
-    draw(episodes[0], figures, "", f"plant={plant}", pole, x_max, mp4)
-    if history:
-        curve = learning_curve(history, task.measure)
-        style.save(curve, figures / "learning_curve.png")
+    try:
+        if onboard:
+            draw(onboard[0], figures, "onboard_", f"plant={plant}, on the board", pole, x_max, mp4)
+        draw(episodes[0], figures, "", f"plant={plant}", pole, x_max, mp4)
+        if history:
+            style.save(learning_curve(history, task.measure), figures / "learning_curve.png")
+    except OSError as error:  # such as a full disk: the numbers are few, and need less room
+        failed = error
     write_json(folder / METRICS, content)
+    if failed is not None:
+        raise failed
     return summary
 
 

@@ -8,7 +8,7 @@ from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.evaluation.episodes import Policy, run_batch
 from cartpole_rl.evaluation.metrics import same_as_host
 from cartpole_rl.reporting.animation import side_by_side, write_animation
-from cartpole_rl.reporting.episodes import report_episodes
+from cartpole_rl.reporting.episodes import report_episodes, summarized
 from cartpole_rl.reporting.scores import score_columns, score_table
 from cartpole_rl.reporting.texts import count_text, cut_off
 from cartpole_rl.rig.hardware import nominal_hardware
@@ -53,27 +53,33 @@ def evaluate(config: EvaluateConfig, folder: Path) -> None:
             if config.drives_on_board:
                 for episode in evaluation.onboard_episodes():
                     onboard.append(episode)
-    finally:  # after a broken link or Ctrl-C, the episodes until then are reported
+    except BaseException:  # after a broken link or Ctrl-C, the episodes until then are reported
         if episodes:
-            report_evaluation(evaluation, episodes, onboard, folder)
+            report_evaluation(evaluation, episodes, onboard, folder, next_command=None)
+        raise
+    report_evaluation(evaluation, episodes, onboard, folder, next_command(evaluation))
 
 
 def report_evaluation(
-    evaluation: Evaluation, episodes: Sequence[Episode], onboard: Sequence[Episode], folder: Path
+    evaluation: Evaluation,
+    episodes: Sequence[Episode],
+    onboard: Sequence[Episode],
+    folder: Path,
+    next_command: str | None,
 ) -> None:
-    """Write metrics.json and figures/, and print the scores; `onboard` are those that the board drove."""
+    """Print the scores, and write metrics.json and figures/; `onboard` are those that the board drove."""
     plant, settings = evaluation.config.plant.kind, evaluation.settings
     link = evaluation.env.plant.link_figures()
     mp4 = evaluation.config.animation.mp4
-    summary = report_episodes(
-        folder, episodes, plant, settings.pole, settings.task, link, onboard=onboard, mp4=mp4
-    )
     heading = f"plant={plant}, {count_text(len(episodes))}"
+    summary, _ = summarized(episodes, settings.task.x_max)  # is printed first: figures can fail
     if onboard:
-        print(score_columns({"this computer": summary, "on the board": summary["onboard"]}, heading))
+        by_board, _ = summarized(onboard, settings.task.x_max)
+        print(score_columns({"this computer": summary, "on the board": by_board}, heading))
         print(same_motors(onboard))
     else:
         print(score_table(summary, heading))
+    report_episodes(folder, episodes, plant, settings.pole, settings.task, link, onboard=onboard, mp4=mp4)
     if settings.guard.active:
         print(f"track guard: {settings.guard.active}")
     for line in cut_off([*episodes, *onboard]):
@@ -83,7 +89,7 @@ def report_evaluation(
     if evaluation.repetition:
         print(compared(evaluation.repetition, episodes[0]))
     print_loop_time(link.get("latency_override"))
-    print_results(folder, f"{METRICS} and {FIGURES}/", next_command(evaluation))
+    print_results(folder, f"{METRICS} and {FIGURES}/", next_command)
 
 
 def same_motors(onboard: Sequence[Episode]) -> str:
@@ -117,7 +123,9 @@ def next_command(evaluation: Evaluation) -> str:
         return f"cartpole-finetune {run} {plant}"
     if evaluation.settings.task.evaluation_start != evaluation.training.task.evaluation_start:
         return f"cartpole-evaluate {run} guard=careful {plant} episodes=1"
-    return f"cartpole-identify {plant} pole={emulator_for(known) or POLES[0]}"
+    stated = config.pole is not None or config.plant.known_pole_length(config.emulator) is not None
+    named = emulator_for([evaluation.settings.pole] if stated else known)
+    return f"cartpole-identify {plant} pole={named or '<yours>.yaml'}"
 
 
 def compared(again: Repetition, episode: Episode) -> str:

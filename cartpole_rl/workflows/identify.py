@@ -57,7 +57,16 @@ from cartpole_rl.run_folder import (
     write_json,
 )
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.terminal import confirm, print_message, print_results, progress_bar, shown, waiting
+from cartpole_rl.terminal import (
+    as_word,
+    confirm,
+    print_message,
+    print_results,
+    progress_bar,
+    shown,
+    waiting,
+    words_given,
+)
 from cartpole_rl.workflows.build import precedence, use_threads
 from cartpole_rl.workflows.checks import note_other_numbers
 from cartpole_rl.workflows.config import IdentifyConfig
@@ -93,7 +102,14 @@ def identify_cart(config: IdentifyConfig, folder: Path) -> None:
     if config.source is None:
         experiment_guard(config.control_period, config.hardware)  # or ConfigError
         write_config(folder, "identify", config.model_dump(mode="json", by_alias=True))
-        record_experiments(config, folder / RECORDINGS)
+        try:
+            record_experiments(config, folder / RECORDINGS)
+        except BaseException:
+            if kept := len([*(folder / RECORDINGS).glob("*.csv")]):
+                print(f"{shown(folder)}/{RECORDINGS}/ holds {kept} of {len(EXPERIMENTS)} experiments; next:")
+                words = as_word("from", shown(folder)), *words_given("cart", "pole", "control_period")
+                print("cartpole-identify", *words)
+            raise
     files = experiments(source)
     recorded = {name: read_recording(path) for name, path in files.items()}
     check_same_encoders({str(files[name]): episode for name, episode in recorded.items()}, config.hardware)

@@ -64,6 +64,7 @@ def test_a_setting_of_each_group_without_a_choice_gets_one_line(command: str) ->
         ("evaluate", "plant.port", "plant.port belongs to plant=driver, serial or text: give one of them"),
         ("finetune", "learner.address", "learner.address belongs to learner=ray: give learner=ray"),
         ("train", "pole.lengths", "pole.lengths belongs to pole=range: give pole=range"),
+        ("preflight", "port", "port: there is no such setting; did you mean plant.port?"),
         ("preflight", "plant.rehomes", "plant.rehomes: there is no such setting; did you mean plant.rehome?"),
         (
             "train",

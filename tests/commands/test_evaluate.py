@@ -1,6 +1,7 @@
 """Repeated episodes: same cart, same start, same score. Predicted ones: nominal cart, start of the cart."""
 
 import json
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +11,15 @@ import yaml
 from command_line import in_process, no_pictures
 from PIL import Image
 
+from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.evaluation.recordings import as_stored, read_origin, read_recording
 from cartpole_rl.physics.parameters import CartParameters
+from cartpole_rl.plants.emulated import EmulatedCart
 from cartpole_rl.workflows import checks
 from cartpole_rl.workflows.build import predicting_env
 from cartpole_rl.workflows.config import EvaluateConfig, load_settings
 from cartpole_rl.workflows.episodes import prepared
-from cartpole_rl.workflows.evaluate import predicted_episode
+from cartpole_rl.workflows.evaluate import next_command, predicted_episode
 
 SAME = ("score", "score_upright", "reward", "steps", "ended_by", "min_track_margin_m", "rms_motor_change")
 
@@ -141,6 +144,28 @@ def test_bad_input_is_told_in_a_line(
     assert named in done.complaint
     assert remedy in done.complaint
     assert not list(evaluated.glob("runs/evaluate/*"))
+
+
+def test_scores_are_kept_if_a_figure_cannot_be_written(trained: Path, tmp_path: Path) -> None:
+    """As on a full disk."""
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full/figures").write_text("a file in the place of the folder")
+    words = (f"run={trained}", "episodes=1", "task=swingup", "task.time_limit=20", "hydra.run.dir=full")
+    done = in_process("evaluate", *words, folder=tmp_path)
+    assert done.code == 1
+    assert "figures" in done.complaint
+    score = read(tmp_path / "full")["score"]["mean"]
+    assert f"{score:.0f}" in done.out
+
+
+def test_the_next_command_identifies_the_pole_that_is_stated(tmp_path: Path) -> None:
+    """Whatever pole the agent knows: the pole's numbers set every force that is identified."""
+    with EmulatedCart(EmulatorSettings()) as cart:
+        on_cart = {"run": "pretrained/medium", "plant": "serial", "plant.port": cart.port}
+        for stated, pole in (({}, "medium"), ({"pole": "large"}, "large")):
+            evaluation = prepared(load_settings(EvaluateConfig, {**on_cart, **stated}))
+            with closing(evaluation.env):
+                assert next_command(evaluation).endswith(f" pole={pole}")
 
 
 def test_the_first_episode_is_drawn_beside_its_prediction(evaluated: Path) -> None:

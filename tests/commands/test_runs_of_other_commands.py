@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from command_line import Outcome, in_process, no_pictures
 
-from cartpole_rl.run_folder import USES, program_of, write_config
+from cartpole_rl.run_folder import USES, program_of, use_of, write_config
 
 MADE_BY = (*USES, "unfinished", "multirun")
 WHAT_TO_DO = {  # with a folder, by what made it
@@ -92,6 +92,17 @@ def contents(folder: Path) -> dict[str, tuple[int, int]]:
     """Size and time of every file."""
     files = (path for path in folder.rglob("*") if path.is_file())
     return {str(path): (path.stat().st_size, path.stat().st_mtime_ns) for path in files}
+
+
+def test_runs_that_cannot_be_used_as_others_of_their_command(tmp_path: Path) -> None:
+    """An evaluation of a cart cannot be repeated; an interrupted identification has recordings alone."""
+    for command, about in (
+        ("evaluate", "its results are metrics.json and figures/"),
+        ("identify", f"it was stopped before its end; cartpole-identify from={tmp_path}/identify reads"),
+    ):
+        write_config(tmp_path / command, command, {"seed": 0})
+        (tmp_path / command / "metrics.json").write_text('{"plant": "serial"}')
+        assert about in use_of(tmp_path / command, command)
 
 
 def test_every_run_says_what_made_it(runs: Path) -> None:

@@ -20,6 +20,7 @@ from cartpole_rl.plants.serial.errors import RefusedError
 from cartpole_rl.plants.serial.plant import SerialPlant, emulated_plant
 from cartpole_rl.plants.settings import EmulatedSettings
 from cartpole_rl.rig.hardware import nominal_hardware
+from cartpole_rl.signals import PARENT
 
 TURN = 4096
 
@@ -162,6 +163,17 @@ class TestProcess:
         host = subprocess.run([sys.executable, "-c", program], stdout=subprocess.PIPE, check=False)
         assert host.returncode == -signal.SIGKILL
         assert ended(int(host.stdout))
+
+    def test_it_ends_if_the_host_died_while_it_started(self) -> None:
+        """Its parent is another process then, from the start."""
+        gone = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], stdout=subprocess.PIPE)
+        cart = subprocess.run(
+            [sys.executable, "-m", "cartpole_rl.emulator", "--exit-with-parent"],
+            env={**os.environ, PARENT: gone.stdout.decode().strip()},
+            timeout=60,
+            check=False,
+        )
+        assert cart.returncode in (0, -signal.SIGTERM)  # its own handler, or none yet
 
 
 def kill(emulated: EmulatedCart, error: Exception | None = None) -> None:

@@ -134,9 +134,12 @@ def test_a_pole_column_alone_is_drawn(ip02: dict[str, float], medium: PoleSettin
 def test_a_cart_without_mass_is_not_drawn(
     ip02: dict[str, float], medium: PoleSettings, tmp_path: Path
 ) -> None:
-    settings = of_samples(tmp_path / "carts.csv", "cart_mass\n0.3\n0.7\n2\n")
-    with pytest.raises(ConfigError, match=r"widen=2 takes cart_mass to -0\.1; it must be above 0"):
-        identified_carts(settings.model_copy(update={"widen": 2.0}), ip02, medium)
+    settings = of_samples(tmp_path / "carts.csv", "cart_mass,cart_coulomb\n0.3,0\n0.7,0.2\n2,0.3\n")
+    """A mass is widened in its logarithm, friction until it is 0."""
+    draws = identified_carts(settings.model_copy(update={"widen": 2.0}), ip02, medium)
+    drawn = CartParameters(draws.draw(500, torch.Generator().manual_seed(0)))
+    assert sorted({round(mass, 4) for mass in drawn.cart_mass.tolist()}) == [0.1286, 0.7, 5.7143]
+    assert sorted({round(friction, 4) for friction in drawn.cart_coulomb.tolist()}) == [0, 0.2, 0.4]
 
 
 def test_the_longest_delay_is_that_of_a_cart_with_the_jitter_of_the_range(

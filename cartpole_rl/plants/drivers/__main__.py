@@ -15,12 +15,12 @@ from cartpole_rl.plants.drivers.bridge import Bridge
 from cartpole_rl.plants.settings import BOARDS
 from cartpole_rl.rig.hardware import Hardware
 from cartpole_rl.scheduling import take_precedence
-from cartpole_rl.signals import end_with_parent
+from cartpole_rl.signals import end_with_parent, starting_process
 
 
 def main(text: str) -> int:
     """Bridge a board until a signal or the end of the parent process; return the exit status."""
-    end_with_parent(os.getppid())
+    end_with_parent(starting_process())
     given = json.loads(text)
     settings = BOARDS.validate_python(given["plant"])
     hardware = Hardware.model_validate(given["hardware"])

@@ -146,6 +146,8 @@ class TextDriver(Driver):
             if not abs(seconds) < CLOCK_WRAP:
                 raise ValueError(f"{word} is not a time in s")
             return round(seconds * unit)
+        if "." in word:
+            raise ValueError(f"time has decimals, which plant.time_unit={self.settings.time_unit} has not")
         ticks = int(word)
         last, us = self._clock or (ticks, ticks * unit)
         passed = (ticks - last + CLOCK_WRAP // 2) % CLOCK_WRAP - CLOCK_WRAP // 2

@@ -124,8 +124,9 @@ def why_not_open(port: str, error: OSError | ValueError | OverflowError) -> str:
     number = getattr(error, "errno", None)
     if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
         meant = f" (did you mean /dev/{port}?)" if os.name == "posix" and "/" not in port else ""
+        wrong = f"does not exist{meant}" if number == errno.ENOENT else "has no device behind it"
         return (
-            f"{port} does not exist{meant}: plug the cart in, or choose one of the ports found: "
+            f"{port} {wrong}: plug the cart in, or choose one of the ports found: "
             f"{named(found_ports()) or 'none'}"
         )
     if number in (errno.EACCES, errno.EPERM):

@@ -91,7 +91,6 @@ BAD = [
     b"1,2,nan",
     b"1,inf,3",
     b"1,2,x",
-    b"1.5,2,3",
     b"\xff,1,2",
     b"1,2,1e30",
     b"9" * 300,
@@ -101,6 +100,11 @@ BAD = [
 def test_counts_with_decimals_name_the_unit(line: Line) -> None:
     assert line.read(b"1,0.00,3\n", b"4,5,6\n") == Measurement(5, 6, 4)
     assert line.driver.why_bad.endswith("cart has decimals, so it is not in counts: give plant.cart_unit")
+
+
+def test_a_time_with_decimals_names_the_unit(line: Line) -> None:
+    assert line.read(b"1.5,2,3\n", b"4,5,6\n") == Measurement(5, 6, 4)
+    assert line.driver.why_bad.endswith("time has decimals, which plant.time_unit=us has not")
 
 
 @pytest.mark.parametrize("bad", BAD)
