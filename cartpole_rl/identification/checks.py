@@ -21,7 +21,7 @@ from cartpole_rl.identification.prediction import (
 )
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.sensors import Motion, falls_upwards, question_sensors
-from cartpole_rl.identification.windows import regular_frames
+from cartpole_rl.identification.windows import recorded_period, regular_frames
 from cartpole_rl.rig.hardware import Hardware
 from cartpole_rl.tasks.episode import Episode, wrap
 
@@ -87,15 +87,32 @@ def check_recordings(
     if seconds < SHORTEST:
         raise RecordingError(f"{seconds:.1f} s of recordings are too short; record {SHORTEST:g} s or more")
     _check_motion(episodes, LEAST_TRAVEL, LEAST_SWING)
-    if falls_upwards(motions(episodes), period):
-        raise RecordingError(
-            "the pole falls upwards in the recordings: the angle is half a turn off; 0 is upright"
-        )
+    check_directions(episodes, period)
     rests = any(_hangs_still(each, period) or stays_up(each, period) for each in episodes)
     if not rests and not zero_is_known(episodes, period, on_step):
         raise RecordingError(
             "the pole never hangs still and is never balanced for 5 s in the recordings, and its motion does "
             "not tell its zero; start one with half a second of the pole at rest"
+        )
+
+
+def shared_period(recordings: Mapping[str, Episode]) -> float:
+    """Return the control period of recordings, s, by the names of their files.
+
+    Raises RecordingError for the first one of another period.
+    """
+    period = recorded_period(next(iter(recordings.values())))
+    for file, episode in recordings.items():
+        with naming(file):
+            regular_frames(episode, period)
+    return period
+
+
+def check_directions(episodes: Sequence[Episode], period: float) -> None:
+    """Raise RecordingError if the angle is half a turn off, or the sign of a column is wrong."""
+    if falls_upwards(motions(episodes), period):
+        raise RecordingError(
+            "the pole falls upwards in the recordings: the angle is half a turn off; 0 is upright"
         )
     _check_signs(episodes, period)
 

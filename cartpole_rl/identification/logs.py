@@ -7,7 +7,6 @@ finite, are left out.
 """
 
 import csv
-import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -28,7 +27,13 @@ Array = NDArray[np.float64]
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 TURN = {"rad": 2 * np.pi, "deg": 360.0, "turn": 1.0}
+UNEVEN = (
+    IRREGULAR + 0.01
+)  # share of the period: a gap of 12 ms in place of 10 is allowed, however it is rounded
+FASTEST = 5.0  # m/s: no cart is faster
+TURNING, STALE = 0.05 / (2 * np.pi), 1 / 3  # turns in three rows; share of such rows that repeat their states
 MOST_COUNTS = 2**31 - 1  # of an encoder, as in recordings
+SLACK = 1e-6  # s, of sums of times
 LONGEST_GAP = 3  # gaps between two rows: rows further apart are missing, also where rows are resampled
 UNKNOWN, TWICE = "with an empty cell or no finite number", "that repeat the row before"
 SHORT, STANDING = "in a part that is too short", "in a part in which motor, cart or pole stand still"
@@ -47,7 +52,10 @@ class Report(NamedTuple):
     saturated: int  # rows with full motor
     beyond: int  # rows with a motor value beyond full
     leaps: int  # rows in which the angle differs by over a quarter of a turn from the row before
+    jumps: int  # rows to which the cart would be faster than FASTEST
+    stale: float  # share of the rows of a turning pole that have the states of the row before
     period: float  # s
+    gap: float  # s, the median between rows
     jitter: float  # s, 95 % of the gaps are within this of the period
 
 
@@ -65,7 +73,7 @@ class Rows(NamedTuple):
         """The mean gap between rows, s, of gaps that are near the median; to four digits."""
         gaps = np.diff(self.time)
         median = float(np.median(gaps))
-        return float(f"{gaps[np.abs(gaps - median) <= IRREGULAR * median].mean():.4g}")
+        return float(f"{gaps[np.abs(gaps - median) <= UNEVEN * median].mean():.4g}")
 
 
 class Log(NamedTuple):
@@ -123,13 +131,13 @@ def cut_log(read: Rows, layout: Layout, encoders: Encoders, period: float) -> Lo
     if layout.resample:
         regular = gaps <= LONGEST_GAP * np.median(gaps)
     else:
-        regular = np.abs(gaps - period) <= IRREGULAR * period
+        regular = np.abs(gaps - period) <= UNEVEN * period
     together = counted[:-1] & counted[1:] & regular
     edges = np.flatnonzero(np.diff(np.concatenate(([False], together, [False]))))
     parts = []
     for first, last in edges.reshape(-1, 2):  # rows, the last one included
         rows = np.arange(first, last + 1)
-        if (last - first) * period < layout.shortest:
+        if time[last] - time[first] < layout.shortest - SLACK:
             left_out[SHORT] = left_out.get(SHORT, 0) + len(rows)
             continue
         turns = np.unwrap(theta[rows], period=1.0) if layout.angle.wraps else theta[rows]
@@ -163,10 +171,20 @@ def cut_log(read: Rows, layout: Layout, encoders: Encoders, period: float) -> Lo
         int((np.abs(motor) >= 0.999).sum()),
         int((np.abs(motor) > 1.001).sum()),
         int((np.abs((np.diff(theta) + 0.5) % 1 - 0.5) > 0.25).sum()),
+        int((np.abs(np.diff(x)) > FASTEST * gaps).sum()),
+        stale_share(x, theta),
         period,
+        float(np.median(gaps)),
         jitter,
     )
     return Log(parts, report)
+
+
+def stale_share(x: Array, theta: Array) -> float:
+    """Return the share of rows of a turning pole, m and turns [T], that have the states of the row before."""
+    turning = np.abs(theta[3:] - theta[:-3]) > TURNING
+    stale = (np.diff(x) == 0) & (np.diff(theta) == 0)
+    return float(stale[1:-1][turning].mean()) if turning.any() else 0.0
 
 
 def signed(positive: Direction) -> int:
@@ -192,10 +210,16 @@ def read_columns(path: Path, layout: Layout) -> dict[str, Array]:
     if len(numbered) < 3:
         raise NotALogError(f"{path} holds no rows; give a log with a line of column names")
     delimiter = layout.delimiter or found_delimiter(numbered[0][1], layout.decimal)
-    rows = [*csv.reader(io.StringIO("\n".join(line for _, line in numbered)), delimiter=delimiter)]
-    heading = [name.strip() for name in rows[0]]
+    rows = [cells(path, number, line, delimiter) for number, line in numbered]
+    heading = rows[0]
     check_columns(path, wanted, heading)
     lines = [number for number, _ in numbered[1:]]
+    for number, row in zip(lines, rows[1:], strict=True):
+        if any(row[len(heading) :]):
+            raise RecordingError(
+                f"{path}, line {number}: it has {len(row)} cells under {len(heading)} names; mend "
+                "decimal= and delimiter= of the layout"
+            )
     return {name: _numbers(path, name, heading.index(name), rows[1:], lines, layout) for name in wanted}
 
 
@@ -261,6 +285,17 @@ def array_columns(
     return columns
 
 
+def cells(path: Path, number: int, line: str, delimiter: str) -> list[str]:
+    """Return the cells of a line, without blanks around them. Raises RecordingError."""
+    if delimiter == " ":  # as in a table that is aligned by blanks
+        return line.split()
+    try:
+        (row,) = csv.reader([line], delimiter=delimiter)
+    except (csv.Error, ValueError):
+        raise RecordingError(f"{path}, line {number}: it is no row of cells; leave the line out") from None
+    return [cell.strip() for cell in row]
+
+
 def found_delimiter(heading: str, decimal: str) -> str:
     """Return the delimiter that occurs most often in the line of column names."""
     candidates = [each for each in ",;\t|" if each != decimal] if decimal == "," else [*",;\t|"]
@@ -273,7 +308,7 @@ def _numbers(
 ) -> Array:
     values = np.empty(len(rows))
     for index, (row, line) in enumerate(zip(rows, lines, strict=True)):
-        cell = row[column].strip() if column < len(row) else ""
+        cell = row[column] if column < len(row) else ""
         try:
             values[index] = float(cell.replace(layout.decimal, ".") or "nan")
         except ValueError:

@@ -74,7 +74,7 @@ class Layout(Settings):
     position: PositionColumn
     angle: AngleColumn
     motor: MotorColumn
-    period: Positive | None = None  # s; None: the median
+    period: Positive | None = None  # s; None: the mean between regular rows
     resample: bool = False  # where the period varies, by lines between the rows
     # column: lowest and highest value of a row that counts
     keep: dict[Name, tuple[Finite, Finite]] = Field(default_factory=dict)

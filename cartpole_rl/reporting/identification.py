@@ -325,7 +325,7 @@ def unexplained_figure(found: Unexplained) -> Figure:
 def _liveliest(episode: Episode) -> float:
     """Return the start (s) of the LONGEST seconds in which the cart moves most."""
     way = np.concatenate((np.zeros(1), np.cumsum(np.abs(np.diff(episode.x)))))
-    starts = episode.time[episode.time <= max(0.0, episode.time[-1] - LONGEST)]
+    starts = episode.time[episode.time <= max(episode.time[0], episode.time[-1] - LONGEST)]
     covered = np.interp(starts + LONGEST, episode.time, way) - np.interp(starts, episode.time, way)
     return float(starts[int(np.argmax(covered))])
 

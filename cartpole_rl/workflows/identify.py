@@ -219,7 +219,8 @@ def next_command(found: Identification, folder: Path) -> str:
     """Return the command that trains on carts like the identified one."""
     run, models, period = shown(folder), found.models, found.dynamics.period
     words = [
-        f"cartpole-train cart={run}/{CART} pole={run}/{POLE} randomization={run}/{RANDOMIZATION}",
+        "cartpole-train",
+        *(as_word(group, run / f"{group}.yaml") for group in ("cart", "pole", "randomization")),
         friction_choice(models.cart_friction, run),
         friction_choice(models.pole_friction, run),
     ]

@@ -18,7 +18,17 @@ from cartpole_rl.errors import RecordingError
 from cartpole_rl.evaluation.exchange import read_mcap, read_minari
 from cartpole_rl.evaluation.recordings import LENGTH, write_recording
 from cartpole_rl.identification.checks import motions
-from cartpole_rl.identification.logs import Log, NotALogError, Report, Rows, cut_log, read_rows
+from cartpole_rl.identification.logs import (
+    FASTEST,
+    STALE,
+    UNEVEN,
+    Log,
+    NotALogError,
+    Report,
+    Rows,
+    cut_log,
+    read_rows,
+)
 from cartpole_rl.identification.sensors import Estimate, Sensors, question_sensors
 from cartpole_rl.identification.settings import ImportConfig, Layout, log_files
 from cartpole_rl.rig.hardware import nominal_hardware
@@ -137,12 +147,17 @@ def doubts(reports: Sequence[Report], sensors: Sensors, period: float, layout: L
             "the pole falls upwards: layout.angle.upright is half a turn off; give the recorded angle of the "
             "upright pole"
         )
-    if sensors.push < -CORRELATED:
+    if sensors.push < -CORRELATED and sensors.lag < -CORRELATED:
+        yield (
+            "positive motor values accelerate the cart to the left, and the pole runs ahead of its cart: "
+            "give the other side for layout.position.positive"
+        )
+    elif sensors.push < -CORRELATED:
         yield (
             "positive motor values accelerate the cart to the left: give the other side for "
             "layout.motor.positive or layout.position.positive"
         )
-    if sensors.lag < -CORRELATED:
+    elif sensors.lag < -CORRELATED:
         yield (
             "the pole runs ahead of its cart instead of staying behind: give the other side for "
             "layout.angle.positive"
@@ -153,8 +168,19 @@ def doubts(reports: Sequence[Report], sensors: Sensors, period: float, layout: L
             f"the angle leaps over a quarter of a turn in {leaps} of {rows} rows: mend layout.angle.unit; "
             "the column may be in degrees"
         )
+    if jumps := sum(each.jumps for each in reports):
+        yield (
+            f"the cart would be faster than {FASTEST:g} m/s in {jumps} of {rows} rows: its counter begins "
+            "anew there, or layout.position.unit is wrong"
+        )
+    stale = max(each.stale for each in reports) > STALE
+    if stale:
+        yield (
+            "rows are written more often than the cart is measured, so states stand still between rows: give "
+            "the period of the measurements as layout.period=..., and layout.resample=true"
+        )
     signs_fit = sensors.push >= -CORRELATED and sensors.lag >= -CORRELATED
-    if signs_fit:
+    if signs_fit and not stale:
         yield from _scale_doubts(sensors, layout)
         yield from _delay_doubts(sensors, period, layout)
     yield from _time_doubts(reports, period, layout)
@@ -174,8 +200,14 @@ def _time_doubts(reports: Sequence[Report], period: float, layout: Layout) -> It
             f"rows are {1e3 * period:g} ms apart, and an identification takes {1e3 * SHORTEST_PERIOD:g} to "
             f"{1e3 * LONGEST_PERIOD:g} ms: mend layout.time.unit{resampled}"
         )
+    gap = float(np.median([report.gap for report in reports]))
     jitter = max(report.jitter for report in reports)
-    if jitter > JITTER * period and not layout.resample:
+    if layout.period is not None and not layout.resample and abs(gap / period - 1) > UNEVEN:
+        yield (
+            f"rows are {1e3 * gap:g} ms apart, not layout.period={period:g} s: leave it out, or give "
+            "layout.resample=true"
+        )
+    elif jitter > JITTER * period and not layout.resample:
         yield (
             f"the time between rows varies: 5 % are over {1e3 * jitter:.1f} ms from the period of "
             f"{1e3 * period:g} ms; give the clock of the cart's board as layout.time, or layout.resample=true"
@@ -287,7 +319,7 @@ def print_summary(
         print(f"doubt: {doubt}")
     cart = "" if config.hardware == nominal_hardware() else " cart=<yours>.yaml"
     rate = "" if math.isclose(period, choice("identify")["control_period"]) else f" control_period={period:g}"
-    following = f"cartpole-identify from={shown(folder)}{cart} pole=<yours>.yaml{rate}"
+    following = f"cartpole-identify {as_word('from', shown(folder))}{cart} pole=<yours>.yaml{rate}"
     if not SHORTEST_PERIOD <= period <= LONGEST_PERIOD:
         following = "cartpole-import, with the layout mended"
     print_results(folder, f"{RECORDINGS}/ and {IMPORTED}", following)

@@ -13,12 +13,12 @@ import numpy as np
 from cartpole_rl.choices import choice, group_choices
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.recordings import LENGTH, read_heading, read_recording
-from cartpole_rl.identification.checks import check_same_encoders
+from cartpole_rl.identification.checks import check_directions, check_same_encoders, shared_period
 from cartpole_rl.identification.ensemble import Ensemble
 from cartpole_rl.identification.fit import Fit, best_fit
 from cartpole_rl.identification.prediction import CERTAIN, REPORTED, errors_at, predict
 from cartpole_rl.identification.rollout import Dynamics
-from cartpole_rl.identification.windows import Windows, cut_windows, held_out_windows, recorded_period, split
+from cartpole_rl.identification.windows import Windows, cut_windows, held_out_windows, split
 from cartpole_rl.physics.friction import CART_FRICTIONS
 from cartpole_rl.physics.models import Models
 from cartpole_rl.plants.learned import LearnedModel, save_model
@@ -57,14 +57,14 @@ def learn_model(config: ModelConfig, folder: Path) -> None:
     use_threads(config.threads)
     paths = [path for source in config.source for path in recordings(source)]
     episodes = [read_recording(path) for path in paths]
-    check_same_encoders(
-        {str(path): each for path, each in zip(paths, episodes, strict=True)}, config.hardware
-    )
+    by_file = {str(path): each for path, each in zip(paths, episodes, strict=True)}
+    check_same_encoders(by_file, config.hardware)
     foreign = config.hardware.scales_text != nominal_hardware().scales_text
     if foreign and config.pole is None and not read_heading(paths[0])[0].get(LENGTH):
         raise ConfigError("pole: the recordings do not say which one it is; give the pole of this cart")
     pole_name, pole = chosen_pole("a model", config.pole, paths)
-    period = recorded_period(episodes[0])
+    period = shared_period(by_file)
+    check_directions(episodes, period)
     training, held_out = split(episodes)
     windows = held_out_windows(held_out, period, max(REPORTED_TIMES))
     fit, ensemble = fit_and_learn(training, config, pole, period)

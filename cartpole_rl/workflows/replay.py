@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 
 from cartpole_rl.evaluation.recordings import read_recording
-from cartpole_rl.identification.checks import check_same_encoders
+from cartpole_rl.identification.checks import check_same_encoders, shared_period
 from cartpole_rl.identification.prediction import Replayed, all_errors, away_from_upright, errors_at, replay
 from cartpole_rl.identification.rollout import Dynamics
-from cartpole_rl.identification.windows import recorded_period
 from cartpole_rl.randomization.poles import Pole
 from cartpole_rl.reporting.episodes import columns
 from cartpole_rl.reporting.predictions import REPORTED_TIMES, replay_figure, replay_table
@@ -45,16 +44,15 @@ def replay_recordings(config: ReplayConfig, folder: Path) -> None:
     settings = recorded_cart(paths) or load_settings(TrainConfig)
     given = {name: value for name in GROUPS if (value := getattr(config, name)) is not None}
     settings = settings.model_copy(update=given)
-    check_same_encoders(
-        {str(path): each for path, each in zip(paths, episodes, strict=True)}, settings.hardware
-    )
+    by_file = {str(path): each for path, each in zip(paths, episodes, strict=True)}
+    check_same_encoders(by_file, settings.hardware)
     name, pole = chosen_pole("a replay", config.pole, paths, settings.pole)
     parameters = {**settings.nominal_with(pole), **(config.parameters or {})}
     check_names(parameters, "parameters")
     check_values(parameters)
     cart = {name: value for name, value in parameters.items() if name not in Pole.model_fields}
     note_other_numbers("replay", cart, [Pole(**{name: parameters[name] for name in Pole.model_fields})])
-    period, plant = recorded_period(episodes[0]), config.plant
+    period, plant = shared_period(by_file), config.plant
     models = settings.models(plant, config.actuator)
     dynamics = Dynamics.of(parameters, models, period, plant.substeps)
     replays = replay(episodes, dynamics, config.restart)

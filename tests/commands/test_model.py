@@ -1,6 +1,7 @@
 """A model is learned from recordings, judged by what it did not see, and is a plant to train on."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,9 @@ import torch
 import yaml
 from command_line import ONCE, TINY, Outcome, in_process
 
+from cartpole_rl.evaluation.recordings import read_recording, write_recording
 from cartpole_rl.plants.learned import load_model
+from cartpole_rl.run_folder import experiments
 from cartpole_rl.workflows.model import next_command
 
 SMALL = (
@@ -39,6 +42,28 @@ def learned(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[P
     done = in_process("model", f"from=[{both}]", *SMALL, "hydra.run.dir=run", folder=folder)
     assert done.code == 0, done.err
     return folder / "run", done
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"motor": -1}, "positive motor values push the cart towards smaller counts"),
+        ({"time": 1.1}, "episode_001.csv: a recording has a frame every 22.0 ms, not every 20.0 ms"),
+    ],
+)
+def test_recordings_that_teach_a_wrong_model_are_refused(
+    change: dict[str, float], said: str, recorded: Path, tmp_path: Path
+) -> None:
+    for path in experiments(recorded).values():
+        episode = read_recording(path)
+        if "motor" in change or path.stem == "episode_001":
+            episode = replace(episode, **{name: by * getattr(episode, name) for name, by in change.items()})
+        write_recording(tmp_path / path.name, episode)
+    for command in ("model", "replay") if "time" in change else ("model",):
+        done = in_process(command, f"from={tmp_path}", "hydra.run.dir=run", folder=tmp_path)
+        assert done.code == 2
+        assert said in done.complaint
+        assert not (tmp_path / "run").exists()
 
 
 def report(folder: Path) -> dict[str, Any]:

@@ -354,7 +354,10 @@ class TestChecks:
             ),
             ({"theta": np.degrees}, "theta is not its encoder's count times"),
             ({"x": lambda x: 1e3 * x}, "x is not its encoder's count times"),
-            ({"time": lambda time: 1.5 * time}, "a frame every 30.0 ms, not every 20.0 ms"),
+            (
+                {"time": lambda time: 1.1 * time},
+                "a frame every 22.0 ms, not every 20.0 ms: give recordings of",
+            ),
         ],
     )
     def test_each_recording_is_checked_and_named(

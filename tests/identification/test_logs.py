@@ -104,6 +104,7 @@ def imported(source: Path) -> ImportConfig:
         ({"delimiter": "\t", "head": "\ufeff# made by hand\n# second line\n"}, {}),
         ({"delimiter": " "}, {}),
         ({"head": "% written by MATLAB\n\n"}, {"comment": "%"}),
+        ({"delimiter": " ", "row": "{:16.9g}"}, {}),
     ],
 )
 def test_a_log_is_read_in_every_style(
@@ -267,6 +268,38 @@ def test_a_resampled_log_is_still_split_where_rows_are_missing(tmp_path: Path, m
     assert [part.steps for part in log.parts] == [159, 379]
 
 
+@pytest.mark.parametrize(("period", "uneven"), [(10, 2), (5, 1)])
+def test_stamps_in_whole_milliseconds_do_not_split_a_log(
+    tmp_path: Path, motion: Columns, period: int, uneven: int
+) -> None:
+    """Gaps a fifth too long or too short, whatever they are after rounding."""
+    gaps = np.full(STEPS, period)
+    gaps[5::20], gaps[6::20] = period - uneven, period + uneven
+    log = read_log(written(tmp_path / "log.csv", {**motion, "t": gaps.cumsum() / 1e3}), layout(), ENCODERS)
+    assert [part.steps for part in log.parts] == [STEPS - 1]
+    assert log.report.period == period / 1e3
+
+
+@pytest.mark.parametrize(("period", "steps"), [(0.1, [80, 80]), (0.005, [1596, 1596])])
+def test_the_shortest_part_is_in_seconds_also_where_rows_are_resampled(
+    tmp_path: Path, motion: Columns, period: float, steps: list[int]
+) -> None:
+    kept = [*range(400), *range(420, 470), *range(500, 900)]  # 8, 1 and 8 s
+    columns = {name: values[kept] for name, values in motion.items()}
+    resample = layout(resample=True, period=period)
+    log = read_log(written(tmp_path / "log.csv", columns), resample, nominal_encoders())
+    assert [part.steps for part in log.parts] == pytest.approx(steps, abs=1)
+
+
+def test_a_wrong_period_is_not_blamed_on_the_clock(tmp_path: Path, motion: Columns) -> None:
+    config = imported(written(tmp_path / "log.csv", motion))
+    config = config.model_copy(update={"layout": layout(period=0.04)})
+    with pytest.raises(
+        RecordingError, match=r"; rows are 20 ms apart, not layout.period=0.04 s: leave it out"
+    ):
+        import_logs(config, tmp_path / "run")
+
+
 def test_the_period_is_the_mean_gap(tmp_path: Path, motion: Columns) -> None:
     """60 Hz with stamps in whole milliseconds: the median gap is 17 ms."""
     columns = {**motion, "t": np.round(np.arange(STEPS) / 60, 3)}
@@ -282,6 +315,8 @@ def test_the_period_is_the_mean_gap(tmp_path: Path, motion: Columns) -> None:
         ("t,x,a\n0,0,0\n1,1,1\n", r"has no column u; it has t, x, a"),
         ("t,x,a,u\n0,0,0,0\n1,0,,0\n2,0,nan,0\n", "fewer than two rows with a number in each of t, x, a, u"),
         ("t,x,a,u\n0,0,0,0\n1,0,two,0\n", "line 3: a is 'two'"),
+        ("t,x,a,u\n0,0,0,0\n0,1,0,1,0,1,0,1\n", "line 3: it has 8 cells under 4 names; mend decimal="),
+        ('t,x,a,u\n0,0,0,"0\n1,0,two,0\n', "line 3: a is 'two'"),
         ("t,x,a,u\n0,0,0,0\n9,0,0,0\n1,0,0,0\n", "the time t goes from 9 to 1 s after row 2; sort the rows"),
     ],
 )
@@ -369,6 +404,20 @@ BROKEN: dict[str, tuple[Callable[[Columns], Columns], list[str]]] = {
     "milliseconds": (lambda each: {**each, "t": 1e3 * each["t"]}, ["rows are 20000 ms apart.*time.unit$"]),
     "2 ms": (lambda each: {**each, "t": each["t"] / 10}, ["rows are 2 ms apart.*layout.resample=true"]),
     "a row later": (lambda each: {**each, "u": np.roll(each["u"], 1)}, ["layout.motor.row=in_force"]),
+    "position sign": (
+        lambda each: {**each, "x": -each["x"]},
+        ["the other side for layout.position.positive$"],
+    ),
+    "counter of 16 bits": (
+        lambda each: {**each, "x": (each["x"] + 0.01) % 0.3},
+        ["the cart would be faster than 5 m/s"],
+    ),
+    "states of every other row": (
+        lambda each: {
+            name: values if name in "tu" else np.repeat(values[::2], 2) for name, values in each.items()
+        },
+        ["rows are written more often than the cart is measured"],
+    ),
     "three rows earlier": (lambda each: {**each, "u": np.roll(each["u"], -3)}, ["over 50 ms later"]),
 }
 
@@ -385,7 +434,8 @@ def test_each_fault_of_a_log_is_a_doubt(
     doubts = re.findall("doubt: (.*)", capsys.readouterr().out)
     for doubt in expected:
         assert any(re.search(doubt, each) for each in doubts), doubts
-    if "time" in expected[0] or "half a turn" in expected[0]:  # nothing else is wrong
+    alone = "time", "half a turn", "position.positive", "more often"
+    if any(each in expected[0] for each in alone):  # nothing else is wrong
         assert len(doubts) == len(expected)
 
 

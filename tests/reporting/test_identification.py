@@ -19,6 +19,7 @@ from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.reporting.identification import (
     CAPTIONS,
+    experiments_figure,
     force_curve,
     friction_curve,
     identification_page,
@@ -53,6 +54,14 @@ def test_the_table_has_values_with_intervals_and_units() -> None:
         ["latency", "12.0 ± 1.0", "ms"],
         ["viscous friction", "1.20 ± 0.10", "1/s"],
     ]
+
+
+def test_the_experiments_of_a_part_of_a_recording_are_drawn(swing_up: Episode) -> None:
+    """The held-out end of a short recording: its time does not begin at 0."""
+    late = dataclasses.replace(swing_up, time=swing_up.time + 48)
+    replayed = Replayed(late, *(np.zeros((0, 1)) for _ in range(5)))
+    figure = experiments_figure({"end": replayed})
+    assert figure.axes[0].get_xlim()[0] == pytest.approx(48, abs=1)
 
 
 def test_the_page_shows_all_results(swing_up: Episode) -> None:
