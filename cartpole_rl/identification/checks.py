@@ -21,11 +21,12 @@ from cartpole_rl.identification.prediction import (
 )
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.sensors import Motion, falls_upwards, question_sensors
-from cartpole_rl.identification.windows import recorded_period, regular_frames
+from cartpole_rl.identification.windows import mean_gap, recorded_period
 from cartpole_rl.rig.hardware import Hardware
 from cartpole_rl.tasks.episode import Episode, wrap
 
 Array = NDArray[np.floating]
+SAME_PERIOD = 0.02  # share by which the period of a recording may differ
 SHORTEST = 20.0  # s
 SHORTEST_HELD_OUT = 5.0  # s
 LEAST_TRAVEL, LEAST_SWING = 0.05, 0.35  # m, rad
@@ -66,7 +67,7 @@ def check_recordings(
     """
     for file, episode in {**fitted, **held_out}.items():
         with naming(file):
-            regular_frames(episode, period)
+            check_period(episode, period)
             _check_units(episode)
             if not np.ptp(episode.motor):
                 raise RecordingError(
@@ -101,11 +102,24 @@ def shared_period(recordings: Mapping[str, Episode]) -> float:
 
     Raises RecordingError for the first one of another period.
     """
-    period = recorded_period(next(iter(recordings.values())))
-    for file, episode in recordings.items():
-        with naming(file):
-            regular_frames(episode, period)
+    periods = {file: recorded_period(episode) for file, episode in recordings.items()}
+    first, period = next(iter(periods.items()))
+    for file, other in periods.items():
+        if abs(other / period - 1) > SAME_PERIOD:
+            raise RecordingError(
+                f"{file} has a frame every {1e3 * other:g} ms, {first} every {1e3 * period:g} ms: give "
+                "recordings of one control period"
+            )
     return period
+
+
+def check_period(episode: Episode, period: float) -> None:
+    """Raise RecordingError for a recording of another control period, s."""
+    if episode.steps and abs((found := mean_gap(episode.time)) / period - 1) > SAME_PERIOD:
+        raise RecordingError(
+            f"a frame every {1e3 * found:g} ms, not every {1e3 * period:g} ms: give "
+            f"control_period={found:g}, and recordings of one period"
+        )
 
 
 def check_directions(episodes: Sequence[Episode], period: float) -> None:

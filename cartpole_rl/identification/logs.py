@@ -19,7 +19,7 @@ from cartpole_rl.errors import RecordingError, reason_of
 from cartpole_rl.identification.checks import shows_motion
 from cartpole_rl.identification.experiments import recording
 from cartpole_rl.identification.settings import Direction, Layout, TimeColumn
-from cartpole_rl.identification.windows import IRREGULAR, history_periods
+from cartpole_rl.identification.windows import UNEVEN, history_periods, mean_gap
 from cartpole_rl.rig.hardware import LARGEST_MOTOR, Encoders
 from cartpole_rl.tasks.episode import Ending, Episode
 
@@ -27,9 +27,6 @@ Array = NDArray[np.float64]
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 TURN = {"rad": 2 * np.pi, "deg": 360.0, "turn": 1.0}
-UNEVEN = (
-    IRREGULAR + 0.01
-)  # share of the period: a gap of 12 ms in place of 10 is allowed, however it is rounded
 FASTEST = 5.0  # m/s: no cart is faster
 TURNING, STALE = 0.05 / (2 * np.pi), 1 / 3  # turns in three rows; share of such rows that repeat their states
 MOST_COUNTS = 2**31 - 1  # of an encoder, as in recordings
@@ -71,9 +68,7 @@ class Rows(NamedTuple):
     @property
     def period(self) -> float:
         """The mean gap between rows, s, of gaps that are near the median; to four digits."""
-        gaps = np.diff(self.time)
-        median = float(np.median(gaps))
-        return float(f"{gaps[np.abs(gaps - median) <= UNEVEN * median].mean():.4g}")
+        return mean_gap(self.time)
 
 
 class Log(NamedTuple):

@@ -22,7 +22,7 @@ LEAST_LEAD = 5  # periods whose positions give an initial state
 HELD_OUT = 5  # one recording in so many is held out
 HELD_OUT_LEAD = 0.2  # s of a held-out window that give its initial state
 IRREGULAR = 0.2  # share of the period that a frame may come early or late
-SAME_PERIOD = 0.02  # share by which the period of a recording may differ
+UNEVEN = IRREGULAR + 0.01  # the same where stamps are rounded to whole milliseconds
 
 
 class NoWindowError(RecordingError):
@@ -171,13 +171,18 @@ def regular_frames(episode: Episode, period: float) -> NDArray[np.bool_]:
     Raises RecordingError for a recording of another control period.
     """
     gaps = np.diff(episode.time)
-    if len(gaps) and abs(np.median(gaps) / period - 1) > SAME_PERIOD:
+    if len(gaps) and abs(np.median(gaps) / period - 1) > IRREGULAR:
         raise RecordingError(
-            f"a recording has a frame every {np.median(gaps) * 1e3:.1f} ms, not every {period * 1e3:.1f} ms: "
-            "give recordings of one period, and the period to cartpole-identify as "
-            f"control_period={recorded_period(episode):g}"
+            f"a recording has a frame every {np.median(gaps) * 1e3:.1f} ms, not every {period * 1e3:.1f} ms"
         )
     return np.abs(gaps / period - 1) < IRREGULAR
+
+
+def mean_gap(time: NDArray[np.float64]) -> float:
+    """Return the mean gap between times, s, of gaps that are near the median; to four digits."""
+    gaps = np.diff(time)
+    median = float(np.median(gaps))
+    return float(f"{gaps[np.abs(gaps - median) <= UNEVEN * median].mean():.4g}")
 
 
 def recorded_period(episode: Episode) -> float:

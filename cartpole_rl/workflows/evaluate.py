@@ -123,8 +123,12 @@ def next_command(evaluation: Evaluation) -> str:
         return f"cartpole-finetune {run} {plant}"
     if evaluation.settings.task.evaluation_start != evaluation.training.task.evaluation_start:
         return f"cartpole-evaluate {run} guard=careful {plant} episodes=1"
-    stated = config.pole is not None or config.plant.known_pole_length(config.emulator) is not None
-    named = emulator_for([evaluation.settings.pole] if stated else known)
+    on_cart, emulator = evaluation.settings.pole, config.emulator
+    stated = config.pole is not None or config.plant.known_pole_length(emulator) is not None
+    stated &= (
+        config.plant.own_pole(emulator, on_cart) is None
+    )  # an emulated cart has the agent's pole in `plant`
+    named = emulator_for([on_cart] if stated else known)
     return f"cartpole-identify {plant} pole={named or '<yours>.yaml'}"
 
 

@@ -21,7 +21,6 @@ from cartpole_rl.identification.checks import motions
 from cartpole_rl.identification.logs import (
     FASTEST,
     STALE,
-    UNEVEN,
     Log,
     NotALogError,
     Report,
@@ -31,6 +30,7 @@ from cartpole_rl.identification.logs import (
 )
 from cartpole_rl.identification.sensors import Estimate, Sensors, question_sensors
 from cartpole_rl.identification.settings import ImportConfig, Layout, log_files
+from cartpole_rl.identification.windows import UNEVEN
 from cartpole_rl.rig.hardware import nominal_hardware
 from cartpole_rl.run_folder import RECORDINGS, write_config, write_json
 from cartpole_rl.terminal import as_word, print_message, print_results, progress_bar, shown

@@ -166,7 +166,10 @@ def test_a_resumed_run_reaches_its_cart_on_another_port(
     done = in_process("finetune", "resume=run", "plant.timeout=2", folder=tmp_path)
     assert done.complaint.endswith("resume uses that run's own config; leave out plant.timeout=2")
     done = in_process("finetune", "resume=other", "plant.port=/dev/gone", folder=tmp_path)
-    assert done.complaint == "cartpole-finetune: resume=other/config.yaml: there is no such file"
+    assert (
+        done.complaint
+        == "cartpole-finetune: resume=other: there is no such folder; give the run folder of a training"
+    )
 
 
 def test_what_a_resumed_run_compiles_with_is_missed_before_the_cart_moves(

@@ -143,7 +143,7 @@ def test_an_agent_trains_on_what_was_found(run: Path, tmp_path: Path) -> None:
             "plant, emulator: from=recorded reads recordings and drives no cart; leave one of them out",
         ),
         ("identify pole=both", "an identification takes one pole"),
-        ("identify from=run control_period=0.01", "a frame every 20.0 ms, not every 10.0 ms"),
+        ("identify from=run control_period=0.01", "a frame every 20 ms, not every 10 ms"),
     ],
 )
 def test_bad_input_is_refused_in_a_line(words: str, said: str, run: Path, tmp_path: Path) -> None:

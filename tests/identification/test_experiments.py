@@ -356,7 +356,7 @@ class TestChecks:
             ({"x": lambda x: 1e3 * x}, "x is not its encoder's count times"),
             (
                 {"time": lambda time: 1.1 * time},
-                "a frame every 22.0 ms, not every 20.0 ms: give recordings of",
+                "a frame every 22 ms, not every 20 ms: give control_period=0.022",
             ),
         ],
     )

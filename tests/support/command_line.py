@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
@@ -18,6 +19,7 @@ from hydra.core.global_hydra import GlobalHydra
 
 from cartpole_rl.cli import VERBS
 from cartpole_rl.command import run_command
+from cartpole_rl.reporting import style
 
 BIN = Path(sys.executable).parent
 TINY = (
@@ -102,10 +104,12 @@ def no_pictures() -> Iterator[None]:
     """Draw no figures and no animations, which take most of the time of a tiny run."""
     episodes = "cartpole_rl.reporting.episodes"
     monitor = "cartpole_rl.workflows.monitor.TrainingMonitor"
-    names = (f"{episodes}.draw", f"{episodes}.style.save", f"{monitor}._log_pictures")
     with contextlib.ExitStack() as stack:
-        for name in names:
+        for name in (f"{episodes}.draw", f"{monitor}._log_pictures"):
             stack.enter_context(patch(name, lambda *arguments: None))
+        # for that module alone: others that are imported meanwhile would keep a patched function
+        unsaved = SimpleNamespace(**{**vars(style), "save": lambda *arguments: None})
+        stack.enter_context(patch(f"{episodes}.style", unsaved))
         yield
 
 
