@@ -205,9 +205,10 @@ def of_module(item: Any) -> str | None:
 
 
 def same_place(one: Any, other: Any) -> bool:
-    """Return whether two objects have the same module and name there."""
-    names = [getattr(each, "__qualname__", each) for each in (one, other)]
-    return of_module(one) == of_module(other) and names[0] == names[1]
+    """Return whether two objects have the same module, and the same name in it."""
+    name = getattr(one, "__qualname__", "<none>")
+    same = of_module(one) == of_module(other) and name == getattr(other, "__qualname__", None)
+    return same and "<" not in name  # several functions can be <lambda> or <locals>
 
 
 def _recall(home: str, kind: str, name: str) -> Extension:

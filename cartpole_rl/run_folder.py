@@ -135,9 +135,10 @@ def use_of(folder: Path, program: str) -> str:
     if program == "distill" and not (folder / CHECKPOINTS / LAST).exists():
         return f"it was stopped before its end; start {PREFIX}{program} again"
     if program == "identify" and not (folder / IDENTIFIED).exists():
-        return (
-            f"it was stopped before its end; {PREFIX}{program} {as_word('from', folder)} reads its recordings"
-        )
+        again = f"start {PREFIX}{program} again"
+        if any((folder / RECORDINGS).glob("*.csv")):
+            again = f"{PREFIX}{program} {as_word('from', folder)} reads its recordings"
+        return f"it was stopped before its end; {again}"
     if program == "evaluate" and not repeatable(folder):
         return f"its results are {METRICS} and {FIGURES}/"
     return USES[program].format(

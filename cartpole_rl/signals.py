@@ -63,7 +63,8 @@ class RaiseOnce:
 
 def starting_process() -> int:
     """Return the process that started this one, also if it has ended since: `PARENT` in the environment."""
-    return int(os.environ.pop(PARENT, "") or os.getppid())
+    given = os.environ.pop(PARENT, "")  # on Windows the parent may be a launcher of Python
+    return int(given) if given and os.name == "posix" else os.getppid()
 
 
 def end_with_parent(parent: int) -> None:

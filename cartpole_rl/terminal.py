@@ -196,8 +196,8 @@ def _write(text: str) -> None:
 
 
 def words_given(*settings: str) -> list[str]:
-    """Return the words of the command line that choose these settings."""
-    return [word for word in sys.argv[1:] if word.partition("=")[0] in settings]
+    """Return the words of the command line that choose these settings, in quotes where a shell needs them."""
+    return [shlex.quote(word) for word in sys.argv[1:] if word.partition("=")[0] in settings]
 
 
 def print_results(folder: Path, files: str, following: str | None) -> None:

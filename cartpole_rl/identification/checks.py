@@ -102,20 +102,23 @@ def shared_period(recordings: Mapping[str, Episode]) -> float:
 
     Raises RecordingError for the first one of another period.
     """
-    periods = {file: recorded_period(episode) for file, episode in recordings.items()}
-    first, period = next(iter(periods.items()))
-    for file, other in periods.items():
+    gaps = {file: mean_gap(episode.time) for file, episode in recordings.items() if episode.steps}
+    first, period = next(iter(gaps.items()))
+    for file, other in gaps.items():
         if abs(other / period - 1) > SAME_PERIOD:
             raise RecordingError(
                 f"{file} has a frame every {1e3 * other:g} ms, {first} every {1e3 * period:g} ms: give "
                 "recordings of one control period"
             )
-    return period
+    return recorded_period(recordings[first])
 
 
 def check_period(episode: Episode, period: float) -> None:
     """Raise RecordingError for a recording of another control period, s."""
-    if episode.steps and abs((found := mean_gap(episode.time)) / period - 1) > SAME_PERIOD:
+    if not episode.steps:
+        return
+    found = mean_gap(episode.time)
+    if all(abs(each / period - 1) > SAME_PERIOD for each in (found, recorded_period(episode))):
         raise RecordingError(
             f"a frame every {1e3 * found:g} ms, not every {1e3 * period:g} ms: give "
             f"control_period={found:g}, and recordings of one period"
@@ -319,5 +322,7 @@ def _check_signs(episodes: Sequence[Episode], period: float) -> None:
 
 
 def _correlation(first: Sequence[Array], second: Sequence[Array]) -> float:
+    if not first:
+        return 0.0
     a, b = np.concatenate(first), np.concatenate(second)
     return correlation(a, b) if len(a) > 10 else 0.0

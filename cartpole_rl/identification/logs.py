@@ -209,12 +209,12 @@ def read_columns(path: Path, layout: Layout) -> dict[str, Array]:
     heading = rows[0]
     check_columns(path, wanted, heading)
     lines = [number for number, _ in numbered[1:]]
-    for number, row in zip(lines, rows[1:], strict=True):
-        if any(row[len(heading) :]):
-            raise RecordingError(
-                f"{path}, line {number}: it has {len(row)} cells under {len(heading)} names; mend "
-                "decimal= and delimiter= of the layout"
-            )
+    longer = [place for place, row in enumerate(rows[1:]) if any(row[len(heading) :])]
+    if 2 * len(longer) > len(lines):  # a few may end with a comment
+        raise RecordingError(
+            f"{path}, line {lines[longer[0]]}: it has {len(rows[longer[0] + 1])} cells under {len(heading)} "
+            "names; mend decimal= and delimiter= of the layout"
+        )
     return {name: _numbers(path, name, heading.index(name), rows[1:], lines, layout) for name in wanted}
 
 
@@ -282,10 +282,10 @@ def array_columns(
 
 def cells(path: Path, number: int, line: str, delimiter: str) -> list[str]:
     """Return the cells of a line, without blanks around them. Raises RecordingError."""
-    if delimiter == " ":  # as in a table that is aligned by blanks
+    if delimiter == " " and '"' not in line:  # as in a table that is aligned by blanks
         return line.split()
     try:
-        (row,) = csv.reader([line], delimiter=delimiter)
+        (row,) = csv.reader([line.strip()], delimiter=delimiter, skipinitialspace=True)
     except (csv.Error, ValueError):
         raise RecordingError(f"{path}, line {number}: it is no row of cells; leave the line out") from None
     return [cell.strip() for cell in row]

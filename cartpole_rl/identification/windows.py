@@ -179,10 +179,14 @@ def regular_frames(episode: Episode, period: float) -> NDArray[np.bool_]:
 
 
 def mean_gap(time: NDArray[np.float64]) -> float:
-    """Return the mean gap between times, s, of gaps that are near the median; to four digits."""
+    """Return the mean gap between times, s, of gaps that are near the median; to four digits.
+
+    It is the median if none is.
+    """
     gaps = np.diff(time)
-    median = float(np.median(gaps))
-    return float(f"{gaps[np.abs(gaps - median) <= UNEVEN * median].mean():.4g}")
+    median = np.median(gaps)
+    near = gaps[np.abs(gaps - median) <= UNEVEN * median]
+    return float(f"{near.mean() if near.size else median:.4g}")
 
 
 def recorded_period(episode: Episode) -> float:

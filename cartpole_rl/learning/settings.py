@@ -88,7 +88,7 @@ class LearningSettings(Settings):
         if self.n_step is not None:
             return self
         assert self.return_time is not None
-        n_step = max(1, round(self.return_time / control_period))
+        n_step = min(max(1, round(self.return_time / control_period)), LONGEST_RETURN)
         chunk = max(self.chunk, n_step)
         updates = round(self.updates * chunk / self.chunk)
         return self.model_copy(update={"n_step": n_step, "chunk": chunk, "updates": updates})

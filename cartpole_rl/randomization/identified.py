@@ -107,7 +107,10 @@ def identified_carts(
         if settings.posterior.suffix == ".csv":
             remedy = "write names of parameters in its first line, and a number of each in every other one"
         if isinstance(error, FileNotFoundError):
-            error, remedy = FileNotFoundError("there is no such file"), "put it back, or give another one"
+            error, remedy = (
+                FileNotFoundError("there is no such file"),
+                "put it back, or start in the folder that its path counts from",
+            )
         raise ConfigError(
             f"randomization.posterior={settings.posterior} cannot be read: {error}; {remedy}"
         ) from None

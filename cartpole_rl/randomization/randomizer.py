@@ -150,14 +150,10 @@ class Randomizer(Draws):
             low, high = self._low[rows], self._high[rows]
             given = shares.expand(len(low), TRIED)
             try:
-                values = line.drawn(given, low, high)
+                values = torch.broadcast_to(line.drawn(given, low, high), given.shape)
             except Exception as error:
                 reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
                 raise ConfigError(f"the distribution {line.distribution} fails: {reason}") from None
-            if getattr(values, "shape", None) != given.shape:
-                raise ConfigError(
-                    f"the distribution {line.distribution} must give a value for each share, [R, N]"
-                )
             room = 1e-9 + 1e-4 * torch.maximum(low.abs(), high.abs())
             if not ((values >= low - room) & (values <= high + room)).all():
                 raise ConfigError(f"the distribution {line.distribution} leaves its bounds")

@@ -86,7 +86,7 @@ class WandbLog(Logger):
         self._run.summary.update({f"summary/{name}": each for name, each in metrics.items()})
 
     def fail(self, error: BaseException) -> None:
-        """Let the run end as crashed."""
+        """Let the run end as failed."""
         self._exit_code = 1
 
     def close(self) -> None:

@@ -86,6 +86,7 @@ def check_training(config: TrainConfig, folder: Path, words: Sequence[str]) -> N
     if config.resume is not None:
         refuse_others(words, ("resume",), "resume uses that run's own config")
         return check_resumable("train", config.resume, folder)
+    config.check_learning()
     if config.compile:
         check_compiler()
     check_carts(config.nominal_cart, config.pole, config.ranges)

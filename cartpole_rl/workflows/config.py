@@ -146,32 +146,28 @@ class TrainConfig(RunSettings, CartPoleSettings):
                 f"learning.transitions={learning.transitions} is too few; give at least "
                 f"{learning.carts * learning.chunk * learning.evaluations}, or fewer evaluations"
             )
-        if learning.collected_transitions <= (warmup := learning.warmup_transitions):
-            chunk = learning.carts * learning.chunk
-            raise ValueError(
-                f"learning.transitions={learning.transitions}: nothing would be learned, as the first "
-                f"{warmup} only fill the buffer (learning.warmup_transitions); give at least "
-                f"{(warmup // chunk + 1) * chunk}, or a shorter warm-up"
-            )
-        if learning.steps > LONGEST_RETURN:
-            raise ValueError(
-                f"learning.return_time={learning.return_time:g} s is {learning.steps} control periods; "
-                f"give at most {LONGEST_RETURN * self.control_period:g}, which is {LONGEST_RETURN}"
-            )
         if self.buffer.size < learning.batch_size:
             raise ValueError(
                 f"buffer.size {self.buffer.size} must be at least learning.batch_size {learning.batch_size}"
             )
         return self
 
-    def with_whole_paths(self) -> Self:
-        """Return the settings with absolute paths of `drawn_from`, for a resumption in another folder."""
-        plant, drawn = self.plant, self.randomization
-        if isinstance(plant, LearnedSettings):
-            plant = plant.model_copy(update={"model": plant.model.absolute()})
-        if isinstance(drawn, IdentifiedSettings):
-            drawn = drawn.model_copy(update={"posterior": drawn.posterior.absolute()})
-        return self.model_copy(update={"plant": plant, "randomization": drawn})
+    def check_learning(self) -> None:
+        """Raise ConfigError for a new training that would learn nothing, or use shorter returns."""
+        learning = self.learning.at(self.control_period)
+        if learning.collected_transitions <= (warmup := learning.warmup_transitions):
+            chunk = learning.carts * learning.chunk
+            raise ConfigError(
+                f"learning.transitions={learning.transitions}: nothing would be learned, as the first "
+                f"{warmup} only fill the buffer (learning.warmup_transitions); give at least "
+                f"{(warmup // chunk + 1) * chunk}, or a shorter warm-up"
+            )
+        asked = round((learning.return_time or 0) / self.control_period)
+        if self.learning.n_step is None and asked > LONGEST_RETURN:
+            raise ConfigError(
+                f"learning.return_time={learning.return_time:g} s is {asked} control periods; "
+                f"give at most {LONGEST_RETURN * self.control_period:g}, which is {LONGEST_RETURN}"
+            )
 
     @property
     def drawn_from(self) -> list[Path]:

@@ -68,7 +68,8 @@ def train(config: TrainConfig, folder: Path) -> float | None:
         restore_weights(agent, checkpoint.state.get("agent", {}), f"resume={folder}")
     policy = DrivingPolicy(agent.greedy_policy(), config.compile)
     evaluate = partial(judge_agent, nominal_env(config), agent, policy, config.seed)
-    config = config.with_whole_paths()  # after the errors about them
+    if checkpoint is None:
+        config.check_learning()
     with claimed(folder):
         write_config(folder, "train", config.model_dump(mode="json"), resumed=checkpoint is not None)
         print_notes(config, env.plant.randomizer)

@@ -102,6 +102,10 @@ def test_runs_that_cannot_be_used_as_others_of_their_command(tmp_path: Path) -> 
     ):
         write_config(tmp_path / command, command, {"seed": 0})
         (tmp_path / command / "metrics.json").write_text('{"plant": "serial"}')
+        if command == "identify":
+            assert "start cartpole-identify again" in use_of(tmp_path / command, command)
+            (tmp_path / command / "recordings").mkdir()
+            (tmp_path / command / "recordings/00_ramps.csv").touch()
         assert about in use_of(tmp_path / command, command)
 
 

@@ -315,7 +315,10 @@ def test_the_period_is_the_mean_gap(tmp_path: Path, motion: Columns) -> None:
         ("t,x,a\n0,0,0\n1,1,1\n", r"has no column u; it has t, x, a"),
         ("t,x,a,u\n0,0,0,0\n1,0,,0\n2,0,nan,0\n", "fewer than two rows with a number in each of t, x, a, u"),
         ("t,x,a,u\n0,0,0,0\n1,0,two,0\n", "line 3: a is 'two'"),
-        ("t,x,a,u\n0,0,0,0\n0,1,0,1,0,1,0,1\n", "line 3: it has 8 cells under 4 names; mend decimal="),
+        (
+            "t,x,a,u\n0,0,0,0,0,0,0,0\n0,1,0,1,0,1,0,1\n",
+            "line 2: it has 8 cells under 4 names; mend decimal=",
+        ),
         ('t,x,a,u\n0,0,0,"0\n1,0,two,0\n', "line 3: a is 'two'"),
         ("t,x,a,u\n0,0,0,0\n9,0,0,0\n1,0,0,0\n", "the time t goes from 9 to 1 s after row 2; sort the rows"),
     ],
