@@ -172,6 +172,7 @@ def test_wandb_is_written_offline(run: Path, points: list[tuple[int, Any]]) -> N
     assert settings["learning.batch_size"] == SHORT["learning.batch_size"]
 
 
+@pytest.mark.usefixtures("folder")  # in which W&B is offline
 def test_a_failed_training_has_failed_in_wandb(tmp_path: Path) -> None:
     pytest.importorskip("wandb", reason="it is an extra")
     from wandb.proto.wandb_internal_pb2 import Record
