@@ -62,7 +62,7 @@ from cartpole_rl.run_folder import (
     RUN_FILES,
     USES,
     check_program,
-    find_training,
+    check_resumed,
     program_of,
     use_of,
 )
@@ -248,7 +248,7 @@ class _OwnChoices:
         if runs is None or len(runs) > 1 or runs[0] is None:
             return []
         run = runs[0].text if isinstance(runs[0], QuotedString) else _text(runs[0])
-        find_training(Path(run))
+        check_resumed(Path(run))
         recorded = read_file("resume", Path(run) / CONFIG)
         self._put(f"{OWN}/resumed", "resumed", {group: recorded.get(group) for group in groups}, "_global_")
         return [f"+{OWN}/resumed=resumed"]

@@ -198,10 +198,15 @@ def find_pretrained(run: Path) -> Path:
     return path
 
 
-def find_training(run: Path) -> Path:
-    """Return the file to resume the training in the folder `run` from. Raises CheckpointError."""
+def check_resumed(run: Path) -> None:
+    """Raise CheckpointError if the folder `run`, which is to be resumed, does not exist."""
     if not run.is_dir():
         raise CheckpointError(f"resume={run}: there is no such folder; give the run folder of a training")
+
+
+def find_training(run: Path) -> Path:
+    """Return the file to resume the training in the folder `run` from. Raises CheckpointError."""
+    check_resumed(run)
     path = run / CHECKPOINTS / RESUME
     if not path.exists():
         raise CheckpointError(
