@@ -17,6 +17,7 @@ Fraction = Annotated[float, Field(ge=0, le=1)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1)]
 
+CONFIDENCE = 0.95  # of every interval that is reported
 NUM_SEEDS = 2**31
 Seed = Annotated[int, Field(ge=0, lt=NUM_SEEDS)]
 

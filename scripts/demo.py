@@ -7,8 +7,6 @@ import time
 from datetime import datetime
 from pathlib import Path
 
-import numpy as np
-
 from cartpole_rl.reporting.scores import SCORES, comparison, mean_text
 from cartpole_rl.reporting.style import save
 from cartpole_rl.reporting.texts import table
@@ -72,16 +70,13 @@ def report(folder: Path) -> None:
         | {cart: mean_text(result[key]) or "never" for cart, result in results.items()}
         for key in SHOWN
     ]
-    means = {name: result["score"] for name, result in results.items()}
     print(table(rows, {"figure": ""} | {cart: cart for cart in results}))
-    simulated, before, after = (mean["mean"] for mean in means.values())
+    simulated, before, after = (result["score"]["mean"] for result in results.values())
     print(
         f"ratio of the scores, emulated / simulated: {before / simulated:.2f}, "
         f"after fine-tuning {after / simulated:.2f}; kept: the policy {tuned['kept']} fine-tuning\n"
     )
-    scores = {name: np.array([e["score"] for e in result["episodes"]]) for name, result in results.items()}
-    intervals = {name: (mean["low"], mean["high"]) for name, mean in means.items() if mean["count"] > 1}
-    save(comparison(scores, "The same agent on each cart", intervals), folder / "comparison.png")
+    save(comparison(results), folder / "comparison.png")
     print(f"scores:          {folder}/comparison.png")
     print(f"learning curve:  {folder}/train/figures/learning_curve.png")
     print(f"TensorBoard:     .venv/bin/tensorboard --logdir {folder}")

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from cartpole_rl.intervals import CONFIDENCE, student_interval
+from cartpole_rl.settings import CONFIDENCE
 from cartpole_rl.tasks.episode import Ending, Episode, is_upright, upright_at_end, upright_since, wrap
 
 RESAMPLES = 5000
@@ -90,7 +90,8 @@ def interval(values: Sequence[float]) -> tuple[float, float] | tuple[None, None]
     if math.isfinite(low) and math.isfinite(high):
         return low, high
     # BCa is undefined for those
-    return student_interval(data)
+    low, high = stats.t.interval(CONFIDENCE, len(data) - 1, data.mean(), stats.sem(data))
+    return float(low), float(high)
 
 
 def summarize(episodes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

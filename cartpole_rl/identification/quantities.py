@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cartpole_rl.identification.fit import Fit
-from cartpole_rl.intervals import CONFIDENCE
 from cartpole_rl.physics.parameters import GRAVITY, CartParameters
+from cartpole_rl.settings import CONFIDENCE
 
 Array = NDArray[np.floating]
 TYPICAL = 5.0  # rad/s, the speed of a wide swing, for which the pole's damping is given

@@ -12,11 +12,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from cartpole_rl.drawing import colours
-from cartpole_rl.errors import ConfigError
-from cartpole_rl.intervals import student_interval
 from cartpole_rl.reporting import style
 from cartpole_rl.reporting.texts import count_text, interval_text, table
 from cartpole_rl.tasks.settings import Measure
@@ -37,7 +35,6 @@ MEAN = 0.12  # offset of its mean and interval
 SPREAD = 0.11  # half width of the cloud of dots
 BOX = 0.07  # half width of a mean's line and of the box that is its interval
 
-Interval = tuple[float, float]
 Array = NDArray[np.float64]
 
 
@@ -90,43 +87,34 @@ def learning_curve(history: Sequence[Mapping[str, Any]], measure: Measure) -> Fi
     return figure
 
 
-def comparison(
-    results: Mapping[str, ArrayLike],
-    title: str = "The same agent on each cart",
-    intervals: Mapping[str, Interval] | None = None,
-) -> Figure:
+def comparison(results: Mapping[str, Mapping[str, Any]]) -> Figure:
     """Draw each episode's score as a dot, the mean with a 95 % interval, and its ratio to the first mean.
 
-    `results` maps a name, such as "simulated", to the scores of its episodes [episodes]. `intervals` maps a
-    name to (low, high) of its mean; if it is missing, Student's t interval is drawn, and none for a single
-    episode. Raises ConfigError for no result or one without episodes.
+    `results` maps a name, such as "simulated", to the content of a metrics.json.
     """
-    scores = {name: np.asarray(values, dtype=np.float64).ravel() for name, values in results.items()}
-    if not scores or not all(each.size for each in scores.values()):
-        raise ConfigError("a comparison needs at least one result, and at least one episode in each")
+    scores = {name: np.array([e["score"] for e in result["episodes"]]) for name, result in results.items()}
     figure = style.new_figure(height=4.6, width=max(5.0, 1.6 + 1.9 * len(scores)))
     axes = figure.subplots()
     style.dress(axes, y="score of an episode", grid="y")
-    for column, (name, each) in enumerate(scores.items()):
-        _draw_result(axes, column, each, (intervals or {}).get(name) or student_interval(each))
+    for column, (name, result) in enumerate(results.items()):
+        _draw_result(axes, column, scores[name], result["score"])
     _name_columns(axes, scores)
     low, high = min(0.0, axes.get_ylim()[0]), axes.get_ylim()[1]
     axes.set_ylim(low, high + 0.05 * (high - low))  # else dots that lie close together are cut at the top
     subtitle = "dots: episodes,  line and box: their mean and its 95 % interval"
-    style.title(axes, style.plain(title), subtitle)
+    style.title(axes, "The same agent on each cart", subtitle)
     return figure
 
 
-def _draw_result(axes: Axes, column: int, scores: Array, interval: Interval) -> None:
+def _draw_result(axes: Axes, column: int, scores: Array, mean: Mapping[str, Any]) -> None:
     """Draw one column: the dots, and next to them the mean with its interval."""
     colour, places = style.series_colour(column), column + DOTS + _sideways(scores.size)
     axes.plot(places, np.sort(scores), "o", color=colour, alpha=0.5, markersize=5, markeredgewidth=0)
-    mean, (low, high) = float(scores.mean()), interval
-    edges = [column + MEAN - BOX, column + MEAN + BOX]
-    if math.isfinite(low) and math.isfinite(high):
-        axes.fill_between(edges, low, high, color=colour, alpha=0.35, linewidth=0)
-    axes.plot(edges, [mean, mean], color=colour, linewidth=2.5, solid_capstyle="butt")
-    text, place = interval_text(mean, low, high), (edges[1], mean)
+    edges, height = [column + MEAN - BOX, column + MEAN + BOX], mean["mean"]
+    if mean["low"] is not None:
+        axes.fill_between(edges, mean["low"], mean["high"], color=colour, alpha=0.35, linewidth=0)
+    axes.plot(edges, [height, height], color=colour, linewidth=2.5, solid_capstyle="butt")
+    text, place = mean_text(mean) or "", (edges[1], height)
     style.note(axes, text, place, "data", (5, 0), va="center", fontsize=style.LABEL_SIZE)
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
-from cartpole_rl.intervals import CONFIDENCE
+from cartpole_rl.settings import CONFIDENCE
 
 RESAMPLES = 5000
 TRIMMED = 0.25  # share of the values cut off at each end
