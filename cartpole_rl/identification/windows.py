@@ -6,7 +6,6 @@ upright. Half a second is long enough for parameters to show and short enough fo
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -204,21 +203,9 @@ def split(episodes: Sequence[Episode]) -> tuple[list[Episode], list[Episode]]:
         )
     ends = [episode.steps - episode.steps // HELD_OUT for episode in episodes]
     return (
-        [part(episode, 0, end) for episode, end in zip(episodes, ends, strict=True)],
-        [part(episode, end, episode.steps) for episode, end in zip(episodes, ends, strict=True)],
+        [episode.part(0, end) for episode, end in zip(episodes, ends, strict=True)],
+        [episode.part(end, episode.steps) for episode, end in zip(episodes, ends, strict=True)],
     )
-
-
-def part(episode: Episode, first: int, last: int) -> Episode:
-    """Return the periods from `first` up to, and without, `last` as an episode."""
-    rows = {"time", "x", "x_dot", "theta", "theta_dot", "counts"}
-    cut = {name: getattr(episode, name)[first : last + 1] for name in rows}
-    steps = {
-        name: getattr(episode, name)[first:last] for name in ("motor", "score", "score_upright", "reward")
-    }
-    guarded = None if episode.guarded is None else episode.guarded[first:last]
-    before = (*episode.motor_before, *episode.motor[:first].tolist())
-    return replace(episode, **cut, **steps, guarded=guarded, motor_before=before)
 
 
 def held_out_windows(episodes: Sequence[Episode], period: float, horizon: float) -> Windows:
@@ -229,7 +216,7 @@ def held_out_windows(episodes: Sequence[Episode], period: float, horizon: float)
     """
     history, lead = history_periods(period), lead_periods(HELD_OUT_LEAD, period)
     ahead = lead + round(horizon / period)
-    later = [part(episode, min((history + ahead) // 2, episode.steps), episode.steps) for episode in episodes]
+    later = [episode.part(min((history + ahead) // 2, episode.steps), episode.steps) for episode in episodes]
     seconds = (history + ahead) * period
     try:
         cut = cut_windows([*episodes, *later], period, seconds, most=1000)

@@ -108,4 +108,4 @@ def pole_froze(speed: Array) -> bool:
 def _shortened(episode: Episode, steps: int, why: str) -> Episode:
     left_out = f"{why}: the last {episode.steps - steps} of {episode.steps} control periods do not count"
     LOGGER.warning("%s", left_out)
-    return replace(episode.first(steps), ended_by=str(Ending.FAULT), left_out=left_out)
+    return replace(episode.part(0, steps), ended_by=str(Ending.FAULT), left_out=left_out)

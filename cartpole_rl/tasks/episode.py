@@ -80,12 +80,16 @@ class Episode:
         """Number of control periods whose outcome was measured: all but the last one before a lost link."""
         return self.steps - (self.ended_by == "link")
 
-    def first(self, steps: int) -> "Episode":
-        """Return the first `steps` control periods."""
+    def part(self, first: int, last: int) -> "Episode":
+        """Return the control periods from `first` up to, and without, `last`."""
         arrays: dict[str, Any] = {each.name: getattr(self, each.name) for each in fields(self)}
-        left = self.steps - steps
-        cut = {name: array[: len(array) - left] for name, array in arrays.items() if hasattr(array, "dtype")}
-        return replace(self, **cut)
+        before = (*self.motor_before, *self.motor[:first].tolist())
+        cut = {
+            name: array[first : last + len(array) - self.steps]
+            for name, array in arrays.items()
+            if hasattr(array, "dtype")
+        }
+        return replace(self, motor_before=before, **cut)
 
     def total(self, measure: Measure) -> float:
         """Return the sum of (6.2) or of (6.1) over the episode."""

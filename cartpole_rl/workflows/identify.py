@@ -26,7 +26,6 @@ from cartpole_rl.identification.identify import Identification, identify
 from cartpole_rl.identification.one_step import one_step_estimates
 from cartpole_rl.identification.quantities import intervals, no_force_up_to
 from cartpole_rl.identification.unknowns import WEIGHED
-from cartpole_rl.identification.windows import part
 from cartpole_rl.physics.laws import Law
 from cartpole_rl.physics.models import REGISTRIES, Models
 from cartpole_rl.physics.parameters import CartParameters
@@ -208,8 +207,8 @@ def split(recordings: Episodes) -> tuple[Episodes, Episodes]:
     if len(names) == 1:
         (episode,) = recordings.values()
         end = episode.steps - episode.steps // HELD_OUT_OF
-        rest = part(episode, end, episode.steps)
-        return {names[0]: part(episode, 0, end)}, {f"the last fifth of {names[0]}": rest}
+        rest = episode.part(end, episode.steps)
+        return {names[0]: episode.part(0, end)}, {f"the last fifth of {names[0]}": rest}
     held_out = [HELD_OUT] if HELD_OUT in recordings else names[HELD_OUT_OF - 1 :: HELD_OUT_OF] or names[-1:]
     fitted = {name: episode for name, episode in recordings.items() if name not in held_out}
     return fitted, {name: recordings[name] for name in held_out}

@@ -35,7 +35,6 @@ from cartpole_rl.identification.experiments import (
 from cartpole_rl.identification.identify import Found, Identification, identify, judged
 from cartpole_rl.identification.one_step import one_step_estimates
 from cartpole_rl.identification.quantities import quantities
-from cartpole_rl.identification.windows import part
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.serial.plant import emulated_plant
@@ -379,7 +378,7 @@ class TestChecks:
         assert "the encoder is frozen, saturated or unplugged; check its cable" in message
 
     def test_a_held_out_recording_that_is_too_short(self, recordings: dict[str, Episode]) -> None:
-        short = part(recordings[HELD_OUT], 0, 100)
+        short = recordings[HELD_OUT].part(0, 100)
         assert refused(recordings, **{HELD_OUT: short}).startswith(
             f"{HELD_OUT}: 2.0 s are too short to judge"
         )
@@ -427,7 +426,7 @@ def test_the_held_out_recording_changes_the_reported_error_alone(
     recordings: dict[str, Episode], found: Identification
 ) -> None:
     fitted, held_out = split(recordings)
-    again = judged(cart_of(found), fitted, {HELD_OUT: part(held_out[HELD_OUT], 0, 400)})
+    again = judged(cart_of(found), fitted, {HELD_OUT: held_out[HELD_OUT].part(0, 400)})
     assert again.fit is found.fit
     assert again.error != found.error
     assert again.warnings == found.warnings

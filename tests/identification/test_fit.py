@@ -185,7 +185,7 @@ class TestWindows:
             cut_windows(episodes, PERIOD, seconds=12.0)
 
     def test_the_period_of_one_that_holds_no_window_is_not_judged(self, episodes: list[Episode]) -> None:
-        late = episodes[0].first(3)
+        late = episodes[0].part(0, 3)
         late = Episode(**{**vars(late), "time": 2 * late.time})
         windows = cut_windows([late, episodes[0]], PERIOD)
         assert windows.number == cut_windows(episodes[:1], PERIOD).number

@@ -76,7 +76,7 @@ def test_a_fault_is_a_truncation_without_the_tracks_penalty(
     motors = sorted({*healthy.motor.tolist()})
     chunks = {}
     for ending in ("time", "fault", "track"):
-        episode = replace(healthy.first(100), ended_by=ending)
+        episode = replace(healthy.part(0, 100), ended_by=ending)
 
         def over(plant: RecordedPlant) -> Any:
             return make_environment(plant, motors)

@@ -139,7 +139,7 @@ class Script:
     def result(self) -> EpisodeResult:
         """Return the next episode."""
         ending = next(self.endings)
-        episode = {"empty": EPISODE.first(0), "encoder": BROKEN, "late": LONG}.get(ending, EPISODE)
+        episode = {"empty": EPISODE.part(0, 0), "encoder": BROKEN, "late": LONG}.get(ending, EPISODE)
         ended_by = {"empty": "fault", "encoder": "fault", "late": "link"}.get(ending, ending)
         return EpisodeResult(replace(episode, ended_by=ended_by), LinkStatistics())
 
@@ -337,7 +337,7 @@ def test_learning_begins_without_a_fit_and_takes_a_later_one(
 ) -> None:
     """The pole fell at once in each episode before the fine-tuning."""
     learner = new_learner()
-    assert learner.start([recorded[0].first(9)])["cart/score_in_simulation"] > 0
+    assert learner.start([recorded[0].part(0, 9)])["cart/score_in_simulation"] > 0
     line = capsys.readouterr().err.splitlines()[-1]
     told = "the simulator is not fitted yet, its carts are drawn as in training: no recording lasts 0.5 s"
     assert line == f"cartpole-finetune: {told}: record longer"

@@ -314,7 +314,7 @@ def test_a_learner_that_cannot_be_used_is_refused_at_the_start(
 def test_a_learner_takes_each_episode_once_and_repeats_no_news(monkeypatch: pytest.MonkeyPatch) -> None:
     """An answer may be lost; a learner that took the place of another one has told nothing yet."""
     monkeypatch.setattr(Learner, "_tune", lambda learner: learner.news.append("fitted"))
-    learner, episodes = Learner(SimpleNamespace()), [EPISODE, EPISODE.first(1), EPISODE.first(0)]
+    learner, episodes = Learner(SimpleNamespace()), [EPISODE, EPISODE.part(0, 1), EPISODE.part(0, 0)]
     while not learner.news:
         time.sleep(0.01)
     taken, news, count = learner.exchange(Taken(), 0, episodes[:2])
