@@ -61,7 +61,6 @@ class Fit:
     rms: Array  # [2] m, rad: robust spread of the residuals of cart and pole
     correlation: Array  # [2] of each residual with the next one in its window
     cost: float
-    iterations: int
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -143,7 +142,7 @@ def fit_cart(
         screened = [problem.minimize(start, guess, SCREENING) for start in starting_points(unknowns)]
         best = min(screened, key=lambda each: each.cost)
     else:
-        best = Match(starting_point(unknowns, near), guess, math.inf, 0)
+        best = Match(starting_point(unknowns, near), guess, math.inf)
     best = problem.minimize(best.point, best.motion, iterations)
     return described(problem, best, windows, unknowns, nominal)
 
@@ -177,7 +176,6 @@ def described(
         spread(problem, best).numpy(),
         np.array([neighbours_correlate(residuals[..., encoder].numpy()) for encoder in range(2)]),
         best.cost,
-        best.iterations,
     )
 
 

@@ -60,19 +60,11 @@ class Candidate(NamedTuple):
         return self.dynamics.models.cart_friction
 
 
-class Found(NamedTuple):
-    """An identified cart."""
-
-    fit: Fit  # under the best friction law; its covariance includes how far the other fits lie from it
-    dynamics: Dynamics
-    candidates: list[Candidate]
-
-
 @dataclass(frozen=True)
 class Identification:
     """The result of an identification: the cart that was found, as held-out recordings judge it."""
 
-    fit: Fit
+    fit: Fit  # under the best friction law; its covariance includes how far the other fits lie from it
     dynamics: Dynamics
     candidates: list[Candidate]
     fitted: list[Replayed]
@@ -155,25 +147,31 @@ def identify(
     candidates = [contenders.get(each.cart_friction, each) for each in screened]
     best = min(contenders.values(), key=lambda each: each.error.size)
     whole = attempt(best.cart_friction, most, substeps, best.fit, apart_from=None)
-    found = Found(widened(whole.fit, best, [*contenders.values()]), whole.dynamics, candidates)
-    return judged(found, fitted, held_out)
+    fit = widened(whole.fit, best, [*contenders.values()])
+    return judged(fit, whole.dynamics, candidates, fitted, held_out)
 
 
-def judged(found: Found, fitted: Mapping[str, Episode], held_out: Mapping[str, Episode]) -> Identification:
+def judged(
+    fit: Fit,
+    dynamics: Dynamics,
+    candidates: list[Candidate],
+    fitted: Mapping[str, Episode],
+    held_out: Mapping[str, Episode],
+) -> Identification:
     """Return the cart with the error of its predictions.
 
     Raises RecordingError for a motion of another cart.
     """
-    explained = check_explained(fitted, found.dynamics, HORIZON)
-    replays = check_explained(held_out, found.dynamics, HORIZON)
+    explained = check_explained(fitted, dynamics, HORIZON)
+    replays = check_explained(held_out, dynamics, HORIZON)
     doubts = [
         *early_endings([*fitted.values(), *held_out.values()]),
-        *warnings(found.fit, next(iter(fitted.values())).encoders),
+        *warnings(fit, next(iter(fitted.values())).encoders),
     ]
     motion = zip(*((each.x_error, each.theta_error, each.theta) for each in replays), strict=True)
     x_error, theta_error, theta = map(np.concatenate, motion)
     error = median_error(x_error, theta_error, theta, np.isfinite(x_error).all(1))
-    return Identification(*found, explained, replays, error, doubts)
+    return Identification(fit, dynamics, candidates, explained, replays, error, doubts)
 
 
 def median_error(

@@ -204,7 +204,6 @@ class Match(NamedTuple):
     point: Tensor  # [U]
     motion: Tensor  # [4, W], the initial states
     cost: float
-    iterations: int
 
 
 class Place(NamedTuple):
@@ -278,10 +277,9 @@ class Matching:
         point's, and keeps its state where the step would not lower its cost.
         """
         costs = self.costs(point.unsqueeze(1), motion.unsqueeze(2))[:, 0]
-        now, made = Place(point, motion, costs), 0
+        now = Place(point, motion, costs)
         damping, own = FIRST_DAMPING, torch.full_like(costs, FIRST_DAMPING)
         for _ in range(iterations):
-            made += 1
             normal, before = self.normal_equations(now.point, now.motion), now
             for _ in range(ATTEMPTS):
                 trial, moved, factor = self.best_trial(before, normal, damping, own)
@@ -296,7 +294,7 @@ class Matching:
                 slow = before.cost - now.cost < CONVERGED * before.cost
                 if slow or normal.length(now.point - before.point) < SETTLED:
                     break
-        return Match(now.point, now.motion, now.cost, made)
+        return Match(now.point, now.motion, now.cost)
 
     def best_trial(
         self, now: Place, normal: NormalEquations, damping: float, own: Tensor

@@ -32,7 +32,7 @@ from cartpole_rl.identification.experiments import (
     reach,
     track_end,
 )
-from cartpole_rl.identification.identify import Found, Identification, identify, judged
+from cartpole_rl.identification.identify import Identification, identify, judged
 from cartpole_rl.identification.one_step import one_step_estimates
 from cartpole_rl.identification.quantities import quantities
 from cartpole_rl.physics.models import Models
@@ -419,21 +419,25 @@ def test_a_recording_that_no_such_cart_moves_like_is_refused(
     assert len(check_explained({name: recordings[name]}, found.dynamics, 1.0)) == 1
     others = {name: changed(recordings[name], motor=lambda motor: np.roll(motor, 40))}
     with pytest.raises(RecordingError, match=rf"^{name}: no cart explains this recording: 1 s of the "):
-        judged(cart_of(found), fitted | others if name in fitted else fitted, held_out | others)
+        judged(
+            found.fit,
+            found.dynamics,
+            found.candidates,
+            fitted | others if name in fitted else fitted,
+            held_out | others,
+        )
 
 
 def test_the_held_out_recording_changes_the_reported_error_alone(
     recordings: dict[str, Episode], found: Identification
 ) -> None:
     fitted, held_out = split(recordings)
-    again = judged(cart_of(found), fitted, {HELD_OUT: held_out[HELD_OUT].part(0, 400)})
+    again = judged(
+        found.fit, found.dynamics, found.candidates, fitted, {HELD_OUT: held_out[HELD_OUT].part(0, 400)}
+    )
     assert again.fit is found.fit
     assert again.error != found.error
     assert again.warnings == found.warnings
-
-
-def cart_of(found: Identification) -> Found:
-    return Found(found.fit, found.dynamics, found.candidates)
 
 
 def changed(episode: Episode, **changes: Callable[[np.ndarray], np.ndarray]) -> Episode:

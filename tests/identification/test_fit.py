@@ -278,6 +278,6 @@ def test_a_parameter_is_unusual_or_not_shown_but_not_both(
 ) -> None:
     mass = next(each for each in unknowns() if each.name == "cart_mass")
     nominal = {**ip02, **medium.nominal.model_dump()}
-    fit = Fit([mass], np.array([point]), np.array([[0.9]]), nominal, np.zeros(2), np.zeros(2), 1.0, 1)
+    fit = Fit([mass], np.array([point]), np.array([[0.9]]), nominal, np.zeros(2), np.zeros(2), 1.0)
     (warning,) = warnings(fit, nominal_encoders())
     assert said in warning

@@ -34,7 +34,7 @@ QUANTITIES = [
     Quantity("latency", "latency", "ms", 12.0, 11.0, 13.0, 5.0),
     Quantity("viscous", "viscous friction", "1/s", 1.2, 1.1, 1.3, 0.6),
 ]
-FIT = Fit([], np.empty(0), np.empty((0, 0)), {}, np.ones(2), np.zeros(2), 1.0, 1)
+FIT = Fit([], np.empty(0), np.empty((0, 0)), {}, np.ones(2), np.zeros(2), 1.0)
 
 
 def candidate(friction: Law, x: float, theta: float) -> Candidate:

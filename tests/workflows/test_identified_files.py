@@ -24,7 +24,7 @@ def write(models: Models, nominal: dict[str, float], folder: Path) -> dict[str, 
     """Write the files of a cart whose numbers have many digits; return the numbers."""
     unknowns = unknowns_of(models, WEIGHED)
     size = len(unknowns)
-    fit = Fit(unknowns, np.full(size, 0.123456789), np.eye(size), nominal, np.ones(2), np.zeros(2), 1.0, 1)
+    fit = Fit(unknowns, np.full(size, 0.123456789), np.eye(size), nominal, np.ones(2), np.zeros(2), 1.0)
     dynamics = Dynamics.of(fit.parameters, models, 0.02, 4)
     error = PredictionError(1e-3, 0.01)
     found = Identification(fit, dynamics, [Candidate(fit, dynamics, error)], [], [], error, [])
