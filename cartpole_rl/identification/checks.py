@@ -3,8 +3,7 @@
 A fit returns a cart for any data. These checks refuse data that no cart could have produced.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -12,16 +11,10 @@ from numpy.typing import NDArray
 
 from cartpole_rl.errors import RecordingError
 from cartpole_rl.identification.fit import correlation
-from cartpole_rl.identification.prediction import (
-    REPORTED,
-    Replayed,
-    away_from_upright,
-    replay_stretches,
-    stretches,
-)
+from cartpole_rl.identification.prediction import REPORTED, Replayed, away_from_upright, replay
 from cartpole_rl.identification.rollout import Dynamics
-from cartpole_rl.identification.sensors import Motion, falls_upwards, question_sensors
-from cartpole_rl.identification.windows import mean_gap, recorded_period
+from cartpole_rl.identification.sensors import Motion, question_sensors, samples_of
+from cartpole_rl.identification.windows import mean_gap, naming, recorded_period
 from cartpole_rl.rig.hardware import Hardware
 from cartpole_rl.tasks.episode import Episode, wrap
 
@@ -43,15 +36,6 @@ TOLERANCE = 2.0  # counts by which positions in SI units may differ from counts
 SIGNIFICANT = 0.2  # correlation from which its sign is certain
 UNEXPLAINED = 0.5  # RMS error of a prediction over the RMS motion; about 0.02 for a cart of this kind
 SMALL = (0.01, 0.09)  # m, rad: a smaller error is never unexplained
-
-
-@contextmanager
-def naming(file: str) -> Iterator[None]:
-    """Put the name of a file before the message of a RecordingError."""
-    try:
-        yield
-    except RecordingError as error:
-        raise RecordingError(f"{file}: {error}") from None
 
 
 def check_recordings(
@@ -127,7 +111,8 @@ def check_period(episode: Episode, period: float) -> None:
 
 def check_directions(episodes: Sequence[Episode], period: float) -> None:
     """Raise RecordingError if the angle is half a turn off, or the sign of a column is wrong."""
-    if falls_upwards(motions(episodes), period):
+    samples = samples_of(motions(episodes), period)
+    if samples is not None and samples.falls_upwards:
         raise RecordingError(
             "the pole falls upwards in the recordings: the angle is half a turn off; 0 is upright"
         )
@@ -167,11 +152,7 @@ def check_explained(recordings: Mapping[str, Episode], dynamics: Dynamics, horiz
 
     Raises RecordingError for the first one, by the name of its file, whose motion the cart does not explain.
     """
-    cut = []
-    for file, episode in recordings.items():
-        with naming(file):
-            cut.append(stretches(episode, dynamics, horizon))
-    replays = replay_stretches([*recordings.values()], cut, dynamics)
+    replays = replay(recordings, dynamics, horizon)
     for file, replayed in zip(recordings, replays, strict=True):
         with naming(file):
             _check_explained(replayed, horizon)

@@ -7,7 +7,7 @@ A replay predicts a whole recording: the simulated cart is put back onto the mea
 near upright an error grows e times in 0.15 s.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from cartpole_rl.identification.matching import finest_scale, match_initial_states
 from cartpole_rl.identification.rollout import Dynamics
-from cartpole_rl.identification.windows import Windows, cut_stretches, joined, lead_periods
+from cartpole_rl.identification.windows import Windows, cut_stretches, joined, lead_periods, naming
 from cartpole_rl.physics.residual import Residual
 from cartpole_rl.tasks.episode import Episode, wrap
 
@@ -108,33 +108,21 @@ class Replayed(NamedTuple):
     theta_error: Array  # [S, T + 1] rad, wrapped
 
 
-def stretches(episode: Episode, dynamics: Dynamics, restart: float) -> Windows:
-    """Return the stretches of a replay.
+def replay(recordings: Mapping[str, Episode], dynamics: Dynamics, restart: float) -> list[Replayed]:
+    """Return each recording beside the cart of `dynamics`, which is put back onto it every `restart` s.
 
-    Raises RecordingError for an episode that is too short, or has another control period than `dynamics`.
+    All run at once. Raises RecordingError, with the name of the file, for one that is too short or has
+    another control period than `dynamics`.
     """
-    return cut_stretches(episode, dynamics.period, restart, lead_periods(LEAD, dynamics.period))
-
-
-def replay(episodes: Sequence[Episode], dynamics: Dynamics, restart: float) -> list[Replayed]:
-    """Return each episode beside the cart of `dynamics`, which is put back onto it every `restart` s.
-
-    Raises RecordingError where an episode has another control period than `dynamics`, or is too short.
-    """
-    return replay_stretches(episodes, [stretches(each, dynamics, restart) for each in episodes], dynamics)
-
-
-def replay_stretches(
-    episodes: Sequence[Episode], cut: Sequence[Windows], dynamics: Dynamics
-) -> list[Replayed]:
-    """Return each episode beside the cart of `dynamics`, in its own `stretches`; all run at once."""
-    if not episodes:
-        return []
+    cut, lead = [], lead_periods(LEAD, dynamics.period)
+    for file, episode in recordings.items():
+        with naming(file):
+            cut.append(cut_stretches(episode, dynamics.period, restart, lead))
     simulated, error, _ = predict(joined(cut), dynamics)
     steps = np.arange(len(simulated)) * dynamics.period
     ends = np.cumsum([windows.number for windows in cut])
     replays = []
-    for episode, windows, end in zip(episodes, cut, ends, strict=True):
+    for episode, windows, end in zip(recordings.values(), cut, ends, strict=True):
         own = slice(end - windows.number, end)
         time = episode.time[windows.first + windows.lead][:, None] + steps
         motion = (each[:, channel, own].T for each in (simulated, error) for channel in range(2))

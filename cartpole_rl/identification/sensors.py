@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.signal import savgol_coeffs
 
+from cartpole_rl.identification.fit import correlation
 from cartpole_rl.physics.parameters import GRAVITY
 
 Array = NDArray[np.float64]
@@ -72,12 +73,6 @@ class Sensors(NamedTuple):
     falls_upwards: bool  # gravity pulls the pole towards the recorded upright: the angle is half a turn off
     push: float  # correlation of motor values and the cart's acceleration: negative means a wrong sign
     lag: float  # of the cart's acceleration and the pole's: negative means a wrong sign
-
-
-def falls_upwards(motions: Sequence[Motion], period: float) -> bool:
-    """Return True if gravity pulls the pole towards its recorded upright; False if motion does not tell."""
-    samples = samples_of(motions, period)
-    return samples is not None and samples.falls_upwards
 
 
 class Samples:
@@ -149,7 +144,7 @@ class Samples:
 
 
 def question_sensors(
-    motions: Sequence[Motion], period: float, seed: int = 0, on_step: Callable[[], object] = lambda: None
+    motions: Sequence[Motion], period: float, on_step: Callable[[], object] = lambda: None
 ) -> Sensors:
     """Return what the motion says of the sensors of recordings with the control period `period`, s.
 
@@ -160,7 +155,7 @@ def question_sensors(
         return Sensors(None, None, None, None, False, 0.0, 0.0)
     delays = np.arange(-EARLIEST, max(LATEST, LONGEST_DELAY / period) + 0.01, max(0.25, FINEST / period))
     pushes = [samples.push(each) for each in delays]
-    dice = np.random.default_rng(seed)
+    dice = np.random.default_rng(0)
     upwards = samples.falls_upwards
     scale = zero = position = delay = None
     if samples.moves and samples.swings:
@@ -170,7 +165,7 @@ def question_sensors(
         zero = None if upwards else zero
     if samples.moves and pushes[0].std() > 0:
         delay = delay_estimate(samples, pushes, period * delays, dice, on_step)
-    correlations = [_correlation(push, samples.x_ddot) for push in pushes]
+    correlations = [correlation(push, samples.x_ddot) for push in pushes]
     lag = -_lag(samples) if upwards else _lag(samples)
     return Sensors(scale, zero, position, delay, upwards, max(correlations, key=abs), lag)
 
@@ -291,9 +286,4 @@ def _lag(samples: Samples) -> float:
         return 0.0
     others = terms[:, ::2]
     free = samples.theta_ddot - others @ np.linalg.lstsq(others, samples.theta_ddot, rcond=None)[0]
-    return _correlation(terms[:, 1], free)
-
-
-def _correlation(first: Array, second: Array) -> float:
-    spread = float(first.std() * second.std())
-    return float(((first - first.mean()) * (second - second.mean())).mean() / spread) if spread > 0 else 0.0
+    return correlation(terms[:, 1], free)

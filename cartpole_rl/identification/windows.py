@@ -6,6 +6,7 @@ upright. Half a second is long enough for parameters to show and short enough fo
 
 import math
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +27,15 @@ UNEVEN = IRREGULAR + 0.01  # the same where stamps are rounded to whole millisec
 
 class NoWindowError(RecordingError):
     """Every recording is too short, or its frames are lost too often."""
+
+
+@contextmanager
+def naming(file: str) -> Iterator[None]:
+    """Put the name of a file before the message of a RecordingError."""
+    try:
+        yield
+    except RecordingError as error:
+        raise RecordingError(f"{file}: {error}") from None
 
 
 class Windows(NamedTuple):

@@ -55,7 +55,7 @@ def replay_recordings(config: ReplayConfig, folder: Path) -> None:
     period, plant = shared_period(by_file), config.plant
     models = settings.models(plant, config.actuator)
     dynamics = Dynamics.of(parameters, models, period, plant.substeps)
-    replays = replay(episodes, dynamics, config.restart)
+    replays = replay(by_file, dynamics, config.restart)
     errors = errors_at(all_errors(replays), REPORTED_TIMES, period)
     kept = np.concatenate([away_from_upright(each) for each in replays])
     away = errors_at(all_errors(replays)[:, :, kept], REPORTED_TIMES, period)
