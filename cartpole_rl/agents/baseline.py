@@ -128,9 +128,7 @@ class EnergyAndRegulator:
     def on_track(self, state: State, force: Tensor) -> Tensor:
         """Return `force` [N], or full braking where the cart would otherwise leave the track."""
         braking = (self.strongest / self.cart.driven_mass).clamp(min=1e-6)
-        stop = state.x + state.x_dot * state.x_dot.abs() / (
-            2 * braking
-        )  # m, where the cart would stop under braking
+        stop = state.x + state.x_dot * state.x_dot.abs() / (2 * braking)  # m, where it would stop
         end = self.cart.track_half_length - MARGIN
         return torch.where(stop.abs() > end, -stop.sign() * self.strongest, force)
 

@@ -142,9 +142,7 @@ class MirrorQNetwork(nn.Module):
         bias = _doubles(self.even_values.bias)
         same, opposite = half / 2 * (even + even[::-1]), half / 2 * (odd - odd[::-1])
         layers.append([np.hstack((same + opposite, same - opposite)), (bias + bias[::-1]) / 2])
-        of_scene, of_image = np.split(
-            layers[0][0], 2, 1
-        )  # the image of the observation is signs * observation
+        of_scene, of_image = np.split(layers[0][0], 2, 1)  # the image is signs * observation
         layers[0][0] = of_scene + of_image * _doubles(self.signs)
         return [tuple(each.astype(np.float32) for each in layer) for layer in layers]
 

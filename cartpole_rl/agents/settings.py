@@ -40,21 +40,15 @@ class AgentSettings(Settings):
     recurrent: Count | None  # units of a recurrent input layer that reads the last frames
     layer_norm: bool
     mirrored: bool  # the network has the mirror symmetry of left and right
-    horizon: Positive | None = (
-        None  # s over which rewards count: their sum is discounted by exp(-t / horizon)
-    )
+    horizon: Positive | None = None  # s over which rewards count: discounted by exp(-t / horizon)
     gamma: Annotated[float, Field(ge=0, lt=1)] | None = None  # or the discount of a control period
     double: bool  # van Hasselt et al., 2016
     action_time: Positive | None = None  # s for which an action seems to last, by the action gap
-    action_gap: Annotated[float, Field(ge=0, lt=1)] | None = (
-        None  # or alpha of advantage learning, 0 for none
-    )
+    action_gap: Annotated[float, Field(ge=0, lt=1)] | None = None  # or alpha of advantage learning; 0: none
     loss: Literal["l2", "smooth_l1"]
     target_tau: Annotated[float, Field(gt=0, le=1)] | None  # Polyak averaging each update
     target_period: Count | None  # or a copy after this many updates
-    average_decay: (
-        Annotated[float, Field(gt=0, lt=1)] | None
-    )  # of the weights that the greedy policy acts with
+    average_decay: Annotated[float, Field(gt=0, lt=1)] | None  # of the weights of the greedy policy
 
     @model_validator(mode="after")
     def _one_way_to_move_the_target(self) -> "AgentSettings":

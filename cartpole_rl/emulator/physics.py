@@ -111,9 +111,8 @@ class CartPhysics:
         model = MODEL.format(thin_inertia=thin, **numbers)
         self._model = mujoco.MjModel.from_xml_string(model)
         tilt = settings.track_tilt
-        self._held = (
-            (1 - larger) * settings.cart_mass * GRAVITY * math.sin(tilt)
-        )  # N, against the larger weight
+        # N, against the larger weight
+        self._held = (1 - larger) * settings.cart_mass * GRAVITY * math.sin(tilt)
         self._model.opt.gravity[:] = (GRAVITY * math.sin(tilt), 0.0, -GRAVITY * math.cos(tilt))
         self._data = mujoco.MjData(self._model)
         self._mj_step = mujoco.mj_step

@@ -17,9 +17,7 @@ from cartpole_rl.rig.hardware import LARGEST_MOTOR, Hardware, hardware_of, nomin
 from cartpole_rl.rig.parameters import check_cart, completed
 from cartpole_rl.settings import Fraction, NonNegative, Positive, Settings
 
-Share = Annotated[
-    float, Field(allow_inf_nan=False, ge=0, le=0.9)
-]  # of frames; above 0.9 hardly any frame would arrive
+Share = Annotated[float, Field(allow_inf_nan=False, ge=0, le=0.9)]  # of frames; above it hardly one arrives
 ONBOARD = Path("onboard")  # as `policy`: the agent that is evaluated
 Port = Literal["auto", "pty", "tcp"]
 MotorValue = Annotated[float, Field(ge=0, le=LARGEST_MOTOR)]
@@ -30,17 +28,14 @@ class EmulatorSettings(Settings):
     """The settings ``emulator.*``. Raises pydantic's ValidationError for a wrong name or value."""
 
     clock: Literal["lockstep", "real"] = "lockstep"  # one period for each frame, or 50 Hz by the wall clock
-    firmware: Literal["python", "c"] = (
-        "python"  # the reference, or the portable C of a real cart, compiled on first use
-    )
+    # the reference, or the portable C of a real cart, compiled on first use
+    firmware: Literal["python", "c"] = "python"
     # folder of an agent in C that drives after START_POLICY; in cartpole-evaluate onboard: the agent of run=
     policy: Path | None = None
     port: Port = "auto"  # a pseudo-terminal or a local TCP port; auto: pty where the system has it
     hardware: Hardware | None = None  # of the cart's file, which the firmware is built with; None: ip02's
     given: tuple[str, ...] = ()  # settings that cart= does not replace: those that the user gave
-    seed: Annotated[int, Field(ge=0)] = (
-        0  # of latencies, disturbed frames, boot position and the hand's angle
-    )
+    seed: Annotated[int, Field(ge=0)] = 0  # of latencies, disturbed frames, boot position, the hand's angle
 
     cart_mass: Positive = 0.735  # kg, rotor included
     pole_mass: Positive = 0.129  # kg
@@ -60,11 +55,9 @@ class EmulatorSettings(Settings):
 
     backdrivability: Fraction = 1.0  # share of the pole's and gravity's force that moves the cart; stepper: 0
     coasting: Fraction = 0.0  # share of cart_viscous that fades with the motor value
-    force_curve: tuple[Coefficient, Coefficient, Coefficient] = (0.0, 0.0198, -0.99)
     # [a, b, c]: F = sign(u) max(0, a u^2 + b |u| + c), N
-    force_asymmetry: Annotated[float, Field(ge=-0.9, le=0.9)] = (
-        0.03  # the force to the right is multiplied by 1 + this
-    )
+    force_curve: tuple[Coefficient, Coefficient, Coefficient] = (0.0, 0.0198, -0.99)
+    force_asymmetry: Annotated[float, Field(ge=-0.9, le=0.9)] = 0.03  # force to the right: times 1 + this
     deadband_left: MotorValue = 55.0  # motor values from minus this to 0 give no force
     deadband_right: MotorValue = 60.0  # motor values from 0 to this give no force
     motor_time_constant: Annotated[float, Field(ge=0, le=1)] = 0.005  # s, first-order lag of the force
@@ -72,9 +65,7 @@ class EmulatorSettings(Settings):
     latency_jitter: Annotated[float, Field(ge=0, le=1)] = 0.001  # s, each latency differs by up to this
 
     track_tilt: Annotated[float, Field(ge=-0.2, le=0.2)] = 0.002  # rad; positive if the right end is lower
-    angle_offset: Annotated[float, Field(ge=-0.5, le=0.5)] = (
-        0.004  # rad, measured angle minus true angle after homing
-    )
+    angle_offset: Annotated[float, Field(ge=-0.5, le=0.5)] = 0.004  # rad, measured minus true after homing
 
     frame_loss: Share = 0.0  # share of frames lost, in each direction
     frame_corruption: Share = 0.0  # share of frames with a wrong byte, in each direction
@@ -87,9 +78,8 @@ class EmulatorSettings(Settings):
     stuck_encoder: Literal["none", "cart", "pole"] = "none"  # the encoder whose count freezes
     stuck_at: NonNegative = 0.0  # s since the start; the count freezes then
 
-    boot: Literal["hanging", "anywhere"] = (
-        "hanging"  # near the middle with a hanging pole, or anywhere with a turning pole
-    )
+    # near the middle with a hanging pole, or anywhere with a turning pole
+    boot: Literal["hanging", "anywhere"] = "hanging"
     start: Literal["hanging", "upright"] = "hanging"  # upright: a hand holds the pole up before START
     knock: NonNegative = 0.0  # rad/s that a hand adds once to a pole that has stood for 2 s, after each START
     journal: Path | None = None  # new file for commands carried out and motor values in force

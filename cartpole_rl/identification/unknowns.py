@@ -18,10 +18,7 @@ from cartpole_rl.rig.parameters import PARAMETERS, Bound, Prior, completed, fact
 
 Array = NDArray[np.floating]
 POLE_LENGTH = "pole_length"  # not a parameter of its own: see `parameters_at`
-LEVELS = (
-    "track_tilt",
-    "angle_offset",
-)  # the last ones, as the order is that of the posterior's random numbers
+LEVELS = ("track_tilt", "angle_offset")  # last, as the posterior draws its random numbers in this order
 OVERCOME = (
     "cart_mass",
     "cart_coulomb",

@@ -227,9 +227,8 @@ class SimulatedPlant(Plant):
             return torch.cat((value, newer))
 
         drive, rows = copied("drive"), len(self._carts.drive)
-        unknown = drive.new_zeros(
-            max(0, rows - len(drive)), drive.shape[1]
-        )  # of a model with a shorter memory
+        # of a model with a shorter memory
+        unknown = drive.new_zeros(max(0, rows - len(drive)), drive.shape[1])
         self._carts.table.copy_(copied("table"))
         self._carts = Carts(self._carts.table, copied("motion"), torch.cat((drive, unknown)))
         self._coming = Starts(*(copied(f"next_{name}") for name in Starts._fields))

@@ -32,7 +32,7 @@ SQLITE, STORE, PICTURES, EXPERIMENT = "sqlite:///", "runs/mlflow.db", "runs/mlfl
 WANDB_RUN, MLFLOW_RUN = (
     "wandb_run.txt",
     "mlflow_run.txt",
-)  # in the run folder: its run; in MLflow's also the store
+)  # its run, in the run folder; MLflow's also the store
 PATIENCE = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1", "MLFLOW_HTTP_REQUEST_TIMEOUT": "10"}  # else minutes
 MOST = 100  # parameters that MLflow takes at once
 

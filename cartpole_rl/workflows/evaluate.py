@@ -125,9 +125,7 @@ def next_command(evaluation: Evaluation) -> str:
         return f"cartpole-evaluate {run} guard=careful {plant} episodes=1"
     on_cart, emulator = evaluation.settings.pole, config.emulator
     stated = config.pole is not None or config.plant.known_pole_length(emulator) is not None
-    stated &= (
-        config.plant.own_pole(emulator, on_cart) is None
-    )  # an emulated cart has the agent's pole in `plant`
+    stated &= config.plant.own_pole(emulator, on_cart) is None  # an emulated cart has the agent's pole
     named = emulator_for([on_cart] if stated else known)
     return f"cartpole-identify {plant} pole={named or '<yours>.yaml'}"
 

@@ -136,10 +136,8 @@ def why_not_open(port: str, error: OSError | ValueError | OverflowError) -> str:
         )
     if number in (errno.EBUSY, errno.EAGAIN):
         return f"{port} is busy: another program has it open; close that (`fuser {port}` names it)"
-    if number == errno.EISDIR or errno.ENOTTY in (
-        number,
-        *getattr(error.__context__, "args", ()),  # pyserial drops the number
-    ):
+    numbers = number, *getattr(error.__context__, "args", ())  # pyserial drops it
+    if number == errno.EISDIR or errno.ENOTTY in numbers:
         return f"{port} is not a serial port; cartpole-find-port lists them"
     return f"{port} cannot be opened as a serial port: {error}"
 
