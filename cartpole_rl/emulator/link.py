@@ -6,7 +6,6 @@ import select
 import socket
 import struct
 from abc import ABC, abstractmethod
-from types import TracebackType
 from typing import Self
 
 from cartpole_rl.emulator.firmware import BANNER
@@ -30,9 +29,7 @@ class Link(ABC):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     @abstractmethod

@@ -8,7 +8,6 @@ which states count as lost, repeated or late. The protocol is described in `docs
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from types import TracebackType
 from typing import Self
 
 from cartpole_rl.errors import LinkError, PlantError
@@ -84,12 +83,7 @@ class SerialCart:
         self.open()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def open(self) -> Info:
@@ -372,17 +366,12 @@ class SerialCart:
         """
         waited = self._unanswered_for()
         self.check_suspension(waited)
-        return waited > self._watchdog_time
+        return waited > WATCHDOG_PERIODS * self.information.period_us * 1e-6
 
     def _unanswered_for(self) -> float:
         """Return the age in s of the state that the next motor value answers; 0 on a lockstep emulator."""
         tracker = self._tracker
         return now() - tracker.answered_at if tracker.has_handed_out and tracker.ticks_alone else 0.0
-
-    @property
-    def _watchdog_time(self) -> float:
-        """The time in s after a state for which the cart takes motor values that answer it."""
-        return WATCHDOG_PERIODS * self.information.period_us * 1e-6
 
     def check_suspension(self, seconds: float) -> None:
         """Raise LinkError if this computer did not answer the cart for too long."""

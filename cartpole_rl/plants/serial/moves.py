@@ -173,7 +173,7 @@ class Centring:
 
     def motor(self, before: State, state: State) -> int:
         """Return the next motor value from the last two states."""
-        passed, metres = interval(before, state), self.hardware.encoders.metres
+        passed, metres = seconds_between(before.time_us, state.time_us), self.hardware.encoders.metres
         away = -metres * state.cart_counts
         target = math.copysign(max(self.slowest, min(TRAVEL_SPEED, abs(away) / SLOWING)), away)
         self.planned += within(GENTLE * passed, target - self.planned)
@@ -234,11 +234,6 @@ def motor_offset(hardware: Hardware, deadband: Mapping[int, float], side: int) -
     """
     missing = nominal_deadband(hardware)[side] - deadband[side]
     return max(0.0, min(hardware.motor_offset, hardware.motor_offset - 2 * missing))
-
-
-def interval(before: State, state: State) -> float:
-    """Return the seconds between two states by the cart's clock."""
-    return seconds_between(before.time_us, state.time_us)
 
 
 def within(limit: float, value: float) -> float:
@@ -336,7 +331,8 @@ def brake(moves: ArmedCart) -> None:
 
 def braking_motor(hardware: Hardware, before: State, state: State) -> int:
     """Return a motor value that brakes the pole and draws the cart to the middle."""
-    passed, metres, radians = interval(before, state), hardware.encoders.metres, hardware.encoders.radians
+    passed = seconds_between(before.time_us, state.time_us)
+    metres, radians = hardware.encoders.metres, hardware.encoders.radians
     x, x_dot = metres * state.cart_counts, metres * (state.cart_counts - before.cart_counts) / passed
     swing = state.pole_counts * radians - math.pi  # from hanging
     swing_dot = (state.pole_counts - before.pole_counts) * radians / passed

@@ -144,7 +144,7 @@ class StateTracker:
         self._driving = True
         self._commanded = None if self._handed_out is None else (sequence, self._handed_out)
         delay = sent_at - self.newest_at
-        self.statistics.latency.add(delay)
+        self.statistics.latency.append(delay)
         self._overdue = self._handed_out if delay > self.period_us * 1e-6 else None
 
     def send_question(self) -> None:
@@ -230,7 +230,7 @@ class StateTracker:
         passed_us = microseconds_between(commanded[1].time_us, state.time_us)
         if not went_back(passed_us):  # otherwise the cart has restarted
             until_arrival_us = passed_us - 1000 * state.command_age_ms - HALF_MILLISECOND
-            self.statistics.loop_times.add(max(0, until_arrival_us) * 1e-6)
+            self.statistics.loop_times.append(max(0, until_arrival_us) * 1e-6)
 
 
 class ClockComparison:
@@ -262,7 +262,7 @@ class ClockComparison:
         if last is None or arrived_at - last > self.LONGEST_PAUSE:
             self._late_until = arrived_at + self.CATCHING_UP
         if arrived_at < self._late_until:
-            self._forget()
+            self._earliest, self._elapsed, self._second = [], 0.0, -1
             return None
         self._elapsed += elapsed
         ahead, second = arrived_at - self._elapsed, int(self._elapsed)
@@ -273,9 +273,6 @@ class ClockComparison:
         self._earliest = [*self._earliest[-self.SECONDS :], ahead] if second == self._second + 1 else [ahead]
         self._second = second
         return rate
-
-    def _forget(self) -> None:
-        self._earliest, self._elapsed, self._second = [], 0.0, -1
 
     def _rate(self) -> float | None:
         complete, half = self._earliest[1:], self.SECONDS // 2  # the first second was cut short
