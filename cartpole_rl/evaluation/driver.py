@@ -30,6 +30,7 @@ from cartpole_rl.signals import UNWINDING, RaiseOnce, end_with_parent, ending_si
 from cartpole_rl.tasks.episode import Episode
 
 GRACE = UNWINDING + 4.0  # s from SIGTERM to SIGKILL: after the unwinding, PyTorch takes seconds to end
+Result = tuple[Episode, LinkStatistics]  # the link since the process started
 MakeEnv = Callable[[Confirm], CartPoleEnv]  # over a cart whose faults are cleared if a person confirms
 
 
@@ -40,21 +41,6 @@ class EpisodeRequest:
     weights: Weights  # of the greedy policy
     epsilon: float  # share of random actions
     seed: int
-
-
-@dataclass(frozen=True)
-class EpisodeResult:
-    """The result of an `EpisodeRequest`: the episode, and the link since the process started."""
-
-    episode: Episode
-    link: LinkStatistics
-
-
-@dataclass(frozen=True)
-class Question:
-    """A fault to be confirmed by a person before it is cleared; the answer is True or False."""
-
-    text: str
 
 
 class Driver:
@@ -97,10 +83,9 @@ class Driver:
         with _alive():
             self._ours.send(drive)
 
-    def result(self) -> EpisodeResult:
+    def result(self) -> Result:
         """Wait for the started episode. Raises the errors of its reset, or LinkError if the process died."""
-        driven = self._receive()
-        assert isinstance(driven, EpisodeResult)
+        driven: Result = self._receive()
         return driven
 
     def close(self) -> None:
@@ -121,8 +106,8 @@ class Driver:
     def _receive(self) -> Any:
         with _alive():
             answer = self._ours.recv()
-        while isinstance(answer, Question):
-            agreed = self._confirm(answer.text)
+        while isinstance(answer, str):  # a fault, to be cleared if a person confirms it
+            agreed = self._confirm(answer)
             with _alive():
                 self._ours.send(agreed)
                 answer = self._ours.recv()
@@ -175,11 +160,11 @@ def _drive_on_demand(
 
 def _ask(pipe: Connection, text: str) -> bool:
     """Let the parent process ask the person at its terminal."""
-    pipe.send(Question(text))
+    pipe.send(text)
     return bool(pipe.recv())
 
 
-def _drive(env: CartPoleEnv, policy: DrivingPolicy, drive: EpisodeRequest, parent: int) -> EpisodeResult:
+def _drive(env: CartPoleEnv, policy: DrivingPolicy, drive: EpisodeRequest, parent: int) -> Result:
     policy.load(drive.weights)
     random = np.random.default_rng(drive.seed)
     actions = len(env.hardware.motors)
@@ -193,4 +178,4 @@ def _drive(env: CartPoleEnv, policy: DrivingPolicy, drive: EpisodeRequest, paren
         return chosen
 
     (episode,) = run_batch(env, act)
-    return EpisodeResult(episode, env.plant.statistics)
+    return episode, env.plant.statistics

@@ -137,15 +137,14 @@ class FinetuningCart:
         cart was stopped.
         """
         for losses in range(1, LARGEST_LOSSES + 1):
-            driven = self.driver.result()
-            self.link, episode = driven.link, driven.episode
+            episode, self.link = self.driver.result()
             if episode.ended_by == Ending.NON_FINITE:
                 raise LearningError(
                     f"{stage} {number + 1}: an observation or an action value was not finite, so the cart "
                     "was stopped; nothing is learned from this episode"
                 )
             if counts(stage, episode):
-                self.keep(stage, number, episode, driven.link)
+                self.keep(stage, number, episode, self.link)
                 return
             lost = f"{stage} {number + 1}: {ending_text(episode)}"
             if losses < LARGEST_LOSSES:
@@ -159,7 +158,7 @@ class FinetuningCart:
         score, step = episode.total(self.measure), self.step(stage, number + 1)
         share = None if episode.guarded is None else float(episode.guarded.mean())
         self.log.scalars({f"cart/score_{stage}": score, f"cart/guarded_{stage}": share}, step)
-        self.log.scalars({f"link/{key}": float(value) for key, value in vars(link.summary()).items()}, step)
+        self.log.scalars({f"link/{key}": float(value) for key, value in link.summary().items()}, step)
         self.log.flush()
         tqdm.write(
             f"{stage} {number + 1}: score {score:z.0f}, ended by {episode.ended_by}{guard_text(episode)}"
@@ -178,7 +177,7 @@ class FinetuningCart:
         """Return counts of lost, damaged and late frames, and the latency; empty before the first episode."""
         if self.link is None:
             return {}
-        return {**vars(self.link.summary()), "latency_override": self.link.latency_override()}
+        return {**self.link.summary(), "latency_override": self.link.latency_override()}
 
 
 def counts(stage: Stage, episode: Episode) -> bool:

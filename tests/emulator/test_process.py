@@ -226,7 +226,7 @@ def test_a_booted_board_prints_text_and_the_host_is_in_step_after_it():
             with SerialCart(emulated.settings) as cart:
                 ticks = [cart.poll_state().tick for _ in range(5)]
                 assert ticks == list(range(ticks[0], ticks[0] + 5))
-                assert cart.statistics.summary().bad_frames == 0
+                assert cart.statistics.summary()["bad_frames"] == 0
 
 
 def refusal(*command: str) -> tuple[int, str]:

@@ -16,7 +16,7 @@ from short_episode import FULL as BROKEN
 from cartpole_rl.choices import choice
 from cartpole_rl.envs.build import simulated_env
 from cartpole_rl.errors import CheckpointError, LinkError, RecordingError
-from cartpole_rl.evaluation.driver import EpisodeRequest, EpisodeResult
+from cartpole_rl.evaluation.driver import EpisodeRequest, Result
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.files import write_bytes
 from cartpole_rl.learning.checkpoints import FINETUNING_FORMAT, AgentCheckpoint, load_training, save_agent
@@ -136,12 +136,12 @@ class Script:
     def start(self, drive: EpisodeRequest) -> None:
         """Do nothing."""
 
-    def result(self) -> EpisodeResult:
+    def result(self) -> Result:
         """Return the next episode."""
         ending = next(self.endings)
         episode = {"empty": EPISODE.part(0, 0), "encoder": BROKEN, "late": LONG}.get(ending, EPISODE)
         ended_by = {"empty": "fault", "encoder": "fault", "late": "link"}.get(ending, ending)
-        return EpisodeResult(replace(episode, ended_by=ended_by), LinkStatistics())
+        return replace(episode, ended_by=ended_by), LinkStatistics()
 
 
 @pytest.fixture

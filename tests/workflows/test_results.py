@@ -17,7 +17,7 @@ def test_a_measured_loop_time_is_printed_with_what_it_lacks(capsys: pytest.Captu
     statistics = LinkStatistics()
     print_loop_time(statistics.latency_override())
     assert capsys.readouterr().out == ""
-    statistics.loop_times.add(0.004)
+    statistics.loop_times.append(0.004)
     print_loop_time(statistics.latency_override())
     assert capsys.readouterr().out == (
         "measured loop time as an override of cartpole-train; add the latency that cartpole-preflight prints "

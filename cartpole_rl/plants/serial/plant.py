@@ -7,7 +7,7 @@ episode. Every ending, by the track, a fault, the link or `close`, sets the moto
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -16,7 +16,7 @@ from torch import Tensor
 from cartpole_rl.emulator.guards import LEVER, lever_um
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import ConfigError, FaultError, LinkError, PlantError, PortError
-from cartpole_rl.plants.emulated import BridgeProcess, EmulatedCart
+from cartpole_rl.plants.emulated import BridgeProcess, CartProcess, EmulatedCart
 from cartpole_rl.plants.serial.cart import RESTARTED, SerialCart
 from cartpole_rl.plants.serial.errors import RefusedError, check_rig, fault_error
 from cartpole_rl.plants.serial.preparation import (
@@ -35,20 +35,6 @@ from cartpole_rl.rig.hardware import Hardware, hardware_of
 from cartpole_rl.rig.parameters import completed
 from cartpole_rl.tasks.episode import Ending
 from cartpole_rl.wire import Fault, Flags, State, seconds_between, ticks_between, went_back
-
-
-class Owned(Protocol):
-    """A resource that a plant owns and closes, such as an emulated cart."""
-
-    @property
-    def died(self) -> str:
-        """The reason why it ended early; empty while it runs."""
-
-    def death(self) -> str:
-        """Return `died`, after a short wait."""
-
-    def close(self) -> None:
-        """End it."""
 
 
 class SerialPlant(OneCartPlant):
@@ -79,7 +65,7 @@ class SerialPlant(OneCartPlant):
         start: StartPosition = "hanging",
         control_period: float = 0.02,
         prompt: Callable[[str], None] = print,
-        owned: Owned | None = None,
+        owned: CartProcess | None = None,
         confirm: Confirm = nobody,
         hardware: Hardware | None = None,
         before_homing: Callable[[], None] = lambda: None,
