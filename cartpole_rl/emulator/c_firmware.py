@@ -24,21 +24,21 @@ from cartpole_rl.wire.messages import MESSAGES
 
 COMPILERS = ("cc", "gcc", "clang")
 FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-ffp-contract=off", f"-DCART_PENDING={MOST_PENDING}")
-RIG = {  # macros of cart_rig.h
-    "CART_NANOMETRES": "nm per count of the cart's encoder",
-    "CART_POLE_COUNTS": "counts per turn of the pole's encoder",
-    "CART_SPAN_UM": "um between the stops, nominal",
-    "CART_SOFT_LIMIT_UM": "um inside a stop: from there on outward motor values give 0",
-    "CART_HARD_LIMIT_UM": "um inside a stop: an armed cart there is faulted",
-    "CART_BRAKING_UM_S2": "um/s^2: full motor inward slows any healthy cart at least so hard",
-    "CART_HARD_PUSH": "smallest motor value that moves any healthy cart",
-    "CART_MOVING_MASS": "kg: cart and pole, roughly, as all numbers below",
-    "CART_MOVING_FRICTION": "N",
-    "CART_MOTOR_OFFSET": "motor value at which the force starts",
-    "CART_MOTOR_PER_NEWTON": "motor values per N beyond it",
-    "CART_GENTLE_FORCE": "N, the largest of homing",
-    "CART_SWITCHES": "end switches: 0 none, 1 left, 2 right, 3 both",
-    "CART_POLE_LEVER_UM": "um: m_p l / (m_c + m_p) of the pole, for the brake",
+RIG = {  # macros of cart_rig.h: attributes of Hardware, those in m as um, and comments
+    "CART_NANOMETRES": ("cart_nanometres_per_count", "nm per count of the cart's encoder"),
+    "CART_POLE_COUNTS": ("pole_counts_per_turn", "counts per turn of the pole's encoder"),
+    "CART_SPAN_UM": ("track_span", "um between the stops, nominal"),
+    "CART_SOFT_LIMIT_UM": ("soft_limit", "um inside a stop: from there on outward motor values give 0"),
+    "CART_HARD_LIMIT_UM": ("hard_limit", "um inside a stop: an armed cart there is faulted"),
+    "CART_BRAKING_UM_S2": ("braking", "um/s^2: full motor inward slows any healthy cart at least so hard"),
+    "CART_HARD_PUSH": ("hard_push", "smallest motor value that moves any healthy cart"),
+    "CART_MOVING_MASS": ("moving_mass", "kg: cart and pole, roughly, as all numbers below"),
+    "CART_MOVING_FRICTION": ("moving_friction", "N"),
+    "CART_MOTOR_OFFSET": ("motor_offset", "motor value at which the force starts"),
+    "CART_MOTOR_PER_NEWTON": ("motor_per_newton", "motor values per N beyond it"),
+    "CART_GENTLE_FORCE": ("gentle_force", "N, the largest of homing"),
+    "CART_SWITCHES": ("switches", "end switches: 0 none, 1 left, 2 right, 3 both"),
+    "CART_POLE_LEVER_UM": ("", "um: m_p l / (m_c + m_p) of the pole, for the brake"),
 }
 LONGEST_ANSWER = 70  # bytes: 2 * CART_FRAME_BYTES
 SNAPSHOT_NUMBERS = 96
@@ -198,25 +198,11 @@ def sources() -> list[Path]:
     return [*core, folder / "host" / "library.c"]
 
 
-def rig_macros(hardware: Hardware, lever: int = LEVER) -> dict[str, str | int]:
+def rig_macros(hardware: Hardware, lever: int = LEVER) -> dict[str, float]:
     """Return the values of the macros in ``firmware/src/cart_rig.h`` for a rig, with a pole's lever in um."""
-    values = (
-        hardware.cart_nanometres_per_count,
-        hardware.pole_counts_per_turn,
-        micrometres(hardware.track_span),
-        micrometres(hardware.soft_limit),
-        micrometres(hardware.hard_limit),
-        micrometres(hardware.braking),
-        hardware.hard_push,
-        repr(hardware.moving_mass),
-        repr(hardware.moving_friction),
-        repr(hardware.motor_offset),
-        repr(hardware.motor_per_newton),
-        repr(hardware.gentle_force),
-        hardware.switches,
-        lever,
-    )
-    return dict(zip(RIG, values, strict=True))
+    values = {name: getattr(hardware, attribute) for name, (attribute, _) in RIG.items() if attribute}
+    whole = {name: micrometres(value) for name, value in values.items() if "_UM" in name}
+    return {**values, **whole, "CART_POLE_LEVER_UM": lever}
 
 
 def definitions(hardware: Hardware) -> tuple[str, ...]:
@@ -227,7 +213,7 @@ def definitions(hardware: Hardware) -> tuple[str, ...]:
 def rig_header(hardware: Hardware, source: str, lever: int = LEVER) -> str:
     """Return the text of ``firmware/src/cart_rig.h`` for the rig and pole of `source`, with a lever in um."""
     macros = [
-        f"#ifndef {name}\n#define {name} {value} /* {RIG[name]} */\n#endif\n"
+        f"#ifndef {name}\n#define {name} {value} /* {RIG[name][1]} */\n#endif\n"
         for name, value in rig_macros(hardware, lever).items()
     ]
     about = (
