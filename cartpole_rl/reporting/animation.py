@@ -38,25 +38,21 @@ def write_animation(path: Path, pictures: Sequence[Image.Image], times: Sequence
             beside.write_bytes(encoded_mp4(pictures, times))
 
 
-def gif(
-    episode: Episode, pole_length: float, track_half_length: float, title: str = "", every: int = EVERY
-) -> bytes:
+def gif(episode: Episode, pole_length: float, track_half_length: float) -> bytes:
     """Return the episode as the bytes of an endless GIF in real time that pauses on its last frame.
 
-    `pole_length` (pivot to tip) and `track_half_length` in m; one frame for each `every` control periods.
+    `pole_length` (pivot to tip) and `track_half_length` in m.
     """
-    return encoded_gif(
-        [*frames(episode, pole_length, track_half_length, title, every)], durations(episode, every)
-    )
+    return encoded_gif([*frames(episode, pole_length, track_half_length)], durations(episode))
 
 
 def frames(
-    episode: Episode, pole_length: float, track_half_length: float, title: str = "", every: int = EVERY
+    episode: Episode, pole_length: float, track_half_length: float, title: str = ""
 ) -> Iterator[Image.Image]:
     """Yield pictures of 480 by 320 pixels in the fixed palette; arguments as for `gif`."""
     drawing = drawn(episode, pole_length, track_half_length)
     background = drawing.background(title)
-    for row in rows(episode, every):
+    for row in rows(episode):
         yield picture(drawing, background, row)
 
 
@@ -76,15 +72,15 @@ def picture(drawing: CartDrawing, background: Image.Image, row: int) -> Image.Im
     return canvas.reduce(FINER).quantize(palette=palette(), dither=Image.Dither.NONE)
 
 
-def rows(episode: Episode, every: int = EVERY) -> list[int]:
-    """Return the rows of the state that become frames: each `every`-th, and the last."""
-    chosen = list(range(0, episode.steps + 1, every))
+def rows(episode: Episode) -> list[int]:
+    """Return the rows of the state that become frames: each EVERY-th, and the last."""
+    chosen = list(range(0, episode.steps + 1, EVERY))
     return chosen if chosen[-1] == episode.steps else [*chosen, episode.steps]
 
 
-def durations(episode: Episode, every: int = EVERY) -> list[int]:
+def durations(episode: Episode) -> list[int]:
     """Return the duration of each frame (ms): real time in the GIF's unit of 10 ms, rounded without drift."""
-    hundredths = np.rint(100 * episode.time[rows(episode, every)]).astype(int)
+    hundredths = np.rint(100 * episode.time[rows(episode)]).astype(int)
     return [max(10 * int(wait), SHORTEST) for wait in np.diff(hundredths)] + [LAST_FRAME]
 
 

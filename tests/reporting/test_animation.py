@@ -56,7 +56,7 @@ def first(episode: Episode, title: str = "") -> Image.Image:
 
 
 def test_ten_seconds_are_251_frames_of_real_time_and_a_rest(swing_up: Episode) -> None:
-    animation = gif(swing_up, POLE, TRACK, "Swing-up")
+    animation = gif(swing_up, POLE, TRACK)
     assert len(animation) < 1_500_000
     with Image.open(io.BytesIO(animation)) as picture:
         assert picture.size == SIZE == (480, 320)
@@ -64,7 +64,7 @@ def test_ten_seconds_are_251_frames_of_real_time_and_a_rest(swing_up: Episode) -
     pictures, waits = zip(*shown(animation), strict=True)
     assert waits == (*[40] * 250, LAST_FRAME)
     assert all(ImageChops.difference(one, after).getbbox() for one, after in pairwise(pictures))
-    for index, expected in enumerate(frames(swing_up, POLE, TRACK, "Swing-up")):
+    for index, expected in enumerate(frames(swing_up, POLE, TRACK)):
         if index % 50 == 0:
             assert ImageChops.difference(pictures[index], expected.convert("RGB")).getbbox() is None
 
