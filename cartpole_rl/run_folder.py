@@ -12,7 +12,7 @@ import subprocess
 import sys
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import distributions
 from pathlib import Path
 from typing import Any
 
@@ -264,7 +264,9 @@ def provenance() -> dict[str, Any]:
     return {
         "command": sys.argv,
         "python": platform.python_version(),
-        "packages": {name: _version(name) for name in PACKAGES},
+        "packages": {
+            name: next((each.version for each in distributions(name=name)), None) for name in PACKAGES
+        },
         "git_commit": git_commit(),
     }
 
@@ -285,10 +287,3 @@ def git_commit() -> str | None:
 def write_json(path: Path, content: Any) -> None:
     """Write indented JSON. Raises ValueError for NaN."""
     write_text(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
-
-
-def _version(name: str) -> str | None:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return None

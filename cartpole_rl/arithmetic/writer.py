@@ -124,7 +124,7 @@ def operation_of(
     """
     if name == "_to_copy":
         return CONVERSIONS[kind], arguments
-    if named or (name == "pow" and not is_two(arguments[1])):
+    if named:
         raise KeyError(name)
     if name == "clamp":
         value, low, high = (*arguments, None, None)[:3]
@@ -138,16 +138,11 @@ def operation_of(
         return "logical_not", arguments
     elif name == "div" and isinstance(arguments[1], int | float) and arguments[1]:
         return "div_by_number", arguments
-    elif name == "pow":
-        return "square", arguments[:1]
+    elif name == "pow" and isinstance(arguments[1], int | float) and arguments[1] == 2:
+        return "square", arguments[:1]  # other powers are not known
     if len(arguments) > MOST_OPERANDS.get(name, 2):
         raise KeyError(name)
     return name, arguments
-
-
-def is_two(exponent: Any) -> bool:
-    """Return True for the number 2; an array of expressions is no number."""
-    return isinstance(exponent, int | float) and exponent == 2
 
 
 def kind_of(dtype: torch.dtype) -> type:

@@ -37,7 +37,9 @@ def episode_metrics(episode: Episode, track_half_length: float) -> dict[str, Any
         "ended_by": episode.ended_by,
         "time_to_upright_s": upright_since(episode.time, episode.theta),
         "upright_fraction": float(upright.mean()),
-        "upright_at_end": float(stands_at_end(episode)),
+        "upright_at_end": float(
+            episode.ended_by == Ending.TIME and upright_at_end(episode.time, episode.theta)
+        ),
         "rms_angle_rad": _rms(wrap(episode.theta[1:])[upright]),
         "rms_position_m": _rms(episode.x[1:][upright]),
         "rms_motor_change": _rms(change),
@@ -45,11 +47,6 @@ def episode_metrics(episode: Episode, track_half_length: float) -> dict[str, Any
         "min_track_margin_m": float(track_half_length - np.abs(episode.x).max()),
         **_same_as_host(episode),
     }
-
-
-def stands_at_end(episode: Episode) -> bool:
-    """Return True for a pole that is upright for the last second of an episode of full length."""
-    return episode.ended_by == Ending.TIME and upright_at_end(episode.time, episode.theta)
 
 
 def same_as_host(episode: Episode) -> tuple[int, int]:

@@ -157,7 +157,8 @@ class LearnedPlant(SimulatedPlant):
             compiled,
             hardware,
         )
-        self._member = torch.zeros(carts, dtype=torch.int64, device=self.device)
+        # the member that moves each cart, [N]; it changes in place when a row resets
+        self.member = torch.zeros(carts, dtype=torch.int64, device=self.device)
         memory = model.residual.memory
         if len(self._carts.drive) < 1 + memory:
             missing = self._carts.drive.new_zeros(1 + memory - len(self._carts.drive), carts)
@@ -173,13 +174,8 @@ class LearnedPlant(SimulatedPlant):
         self._run_learned = Compiled(run) if compiled else run
         self._run = self._run_members
 
-    @property
-    def member(self) -> Tensor:
-        """The member that moves each cart, [N]; it changes in place when a row resets."""
-        return self._member
-
     def _run_members(self, carts: Carts, inputs: Inputs) -> Period:
-        return self._run_learned(carts, inputs, self._residual, (self._member,))
+        return self._run_learned(carts, inputs, self._residual, (self.member,))
 
     def restart(self, rows: Tensor, again: Tensor | None = None) -> TensorDict:
         """Start an episode on the carts `rows` [R], each with a new member, except for `again`."""
@@ -187,8 +183,8 @@ class LearnedPlant(SimulatedPlant):
             self._residual.members, (len(rows),), generator=self._generator, device=self.device
         )
         if again is not None:
-            drawn = torch.where(again, self._member[rows], drawn)
-        self._member.index_copy_(0, rows, drawn)
+            drawn = torch.where(again, self.member[rows], drawn)
+        self.member.index_copy_(0, rows, drawn)
         return super().restart(rows, again)
 
     def step_one(self, motor: int) -> PlantOutput[Numbers]:
@@ -197,12 +193,12 @@ class LearnedPlant(SimulatedPlant):
 
     def snapshot(self) -> dict[str, Any]:
         """Return everything on which the next step depends, for `restore`."""
-        return {**super().snapshot(), "member": self._member.clone()}
+        return {**super().snapshot(), "member": self.member.clone()}
 
     def restore(self, snapshot: Any) -> None:
         """Return to `snapshot`."""
         super().restore(snapshot)
-        self._member.copy_(snapshot["member"])
+        self.member.copy_(snapshot["member"])
 
 
 def learned_carts(

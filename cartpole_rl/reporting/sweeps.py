@@ -94,7 +94,6 @@ class Sweep:
     """
 
     name: str
-    sources: Sequence[str]
     members: Sequence[Member]
     exclusions: Sequence[Exclusion]
     notes: Sequence[str] = ()
@@ -123,7 +122,7 @@ def read_sweeps(sets: Mapping[str, Sequence[str]], measure: str) -> list[Sweep]:
     """
     agents: dict[Path, Run] = {}
     sweeps = [
-        Sweep(name, sources, [_member(read_run(folder), agents) for folder in _folders(name, sources)], ())
+        Sweep(name, [_member(read_run(folder), agents) for folder in _folders(name, sources)], ())
         for name, sources in sets.items()
     ]
     sweeps = [_without(sweep, lambda member: member.problem) for sweep in sweeps]

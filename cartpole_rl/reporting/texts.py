@@ -50,21 +50,15 @@ def interval_text(
     finest = min(_decimals(mean or max(below, above), DIGITS), most_decimals)
     decimals = min(_decimals(max(below, above), digits=2) if above > 0 or below > 0 else finest, finest)
     if not ends and abs(below - above) <= ASYMMETRY * max(below, above):
-        return f"{_fixed(mean, decimals)} ± {_fixed((below + above) / 2, decimals)}"
-    return f"{_fixed(mean, decimals)} ({_fixed(low, decimals)} to {_fixed(high, decimals)})"
+        return f"{mean:z.{decimals}f} ± {(below + above) / 2:z.{decimals}f}"
+    return f"{mean:z.{decimals}f} ({low:z.{decimals}f} to {high:z.{decimals}f})"
 
 
 def number_text(value: float, most_decimals: int = MOST_DECIMALS) -> str:
     """Return a number with at least three significant digits: "4210", "12.3", "0.00456"; a dash for NaN."""
     if not math.isfinite(value):
         return MISSING
-    return _fixed(value, min(_decimals(value, DIGITS), most_decimals))
-
-
-def _fixed(value: float, decimals: int) -> str:
-    """Return a number with this many decimals; zero has no minus sign."""
-    text = f"{value:.{decimals}f}"
-    return text if float(text) else text.removeprefix("-")
+    return f"{value:z.{min(_decimals(value, DIGITS), most_decimals)}f}"
 
 
 def _decimals(largest: float, digits: int) -> int:

@@ -29,10 +29,8 @@ from cartpole_rl.terminal import print_message
 
 PROJECT, AXIS = "cartpole_rl", "transitions"  # of wandb
 SQLITE, STORE, PICTURES, EXPERIMENT = "sqlite:///", "runs/mlflow.db", "runs/mlflow", "cartpole_rl"
-WANDB_RUN, MLFLOW_RUN = (
-    "wandb_run.txt",
-    "mlflow_run.txt",
-)  # its run, in the run folder; MLflow's also the store
+# in the run folder: its run; in MLflow's also the store
+WANDB_RUN, MLFLOW_RUN = "wandb_run.txt", "mlflow_run.txt"
 PATIENCE = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1", "MLFLOW_HTTP_REQUEST_TIMEOUT": "10"}  # else minutes
 MOST = 100  # parameters that MLflow takes at once
 

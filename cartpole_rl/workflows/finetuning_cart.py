@@ -88,7 +88,7 @@ class FinetuningFiles:
 
     def write_episode(self, stage: Stage, number: int, episode: Episode) -> None:
         """Write an episode's recording."""
-        length = pole_length(self.config)
+        length = self.config.plant.known_pole_length(self.config.emulator)
         header = {"stage": stage, "number": number, LENGTH: "" if length is None else f"{length:.4f}"}
         write_recording(self.path(stage, number), episode, header)
 
@@ -96,11 +96,6 @@ class FinetuningFiles:
         """Write the checkpoint to resume from, after learning from `learned` episodes."""
         checkpoint = TrainingCheckpoint(self.config.model_dump(mode="json"), state, learned)
         save_training(self.folder, checkpoint, FINETUNING_FORMAT)
-
-
-def pole_length(config: FinetuneConfig) -> float | None:
-    """Return the length (m) of the pole on the cart; None if the settings do not state it."""
-    return config.plant.known_pole_length(config.emulator)
 
 
 class FinetuningCart:

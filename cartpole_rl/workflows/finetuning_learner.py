@@ -38,7 +38,7 @@ from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.terminal import print_message
 from cartpole_rl.workflows.build import known_poles, new_agent
 from cartpole_rl.workflows.config import FinetuneConfig, TrainConfig
-from cartpole_rl.workflows.finetuning_cart import Stage, pole_length
+from cartpole_rl.workflows.finetuning_cart import Stage
 from cartpole_rl.workflows.poles import guard_holds
 
 PRINT = partial(print_message, "finetune")
@@ -247,7 +247,7 @@ class CartLearner:
     def transitions(self, episode: Episode) -> list[Any]:
         """Return an episode's transitions in chunks, as the agent observes them."""
         motors = self.settings.actions.motors
-        length = pole_length(self.config)
+        length = self.config.plant.known_pole_length(self.config.emulator)
         make_env, hardware = partial(environment, self.settings), self.settings.hardware
         chunks = recorded_chunks(episode, make_env, motors, length, hardware)
         learned, measured = sum(chunk.shape[1] for chunk in chunks), episode.measured_steps

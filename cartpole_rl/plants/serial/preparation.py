@@ -17,7 +17,7 @@ from cartpole_rl.plants.serial.errors import fault_words
 from cartpole_rl.plants.serial.link import now
 from cartpole_rl.plants.serial.moves import recentre
 from cartpole_rl.plants.settings import BoardSettings
-from cartpole_rl.wire import Flags, State, microseconds_between
+from cartpole_rl.wire import Flags, microseconds_between
 
 LOGGER = logging.getLogger(__name__)
 
@@ -196,7 +196,7 @@ class Preparation:
             state = self._cart.poll_state()
             if not self._cart.flags & Flags.HOMED:
                 raise LinkError(RESTARTED)
-            pole = self._pole_angle(state)
+            pole = 2 * math.pi * state.pole_counts / self._cart.information.pole_counts_per_turn
             off = math.remainder(pole - position.angle, 2 * math.pi)
             window.append((state.time_us, pole))
             if abs(off) > position.tolerance or _spread(window) > position.sway:
@@ -209,9 +209,6 @@ class Preparation:
                     f"{math.degrees(position.tolerance):.0f} deg of {self.start}; "
                     f"it is {math.degrees(off):+.1f} deg off: {position.remedy}"
                 )
-
-    def _pole_angle(self, state: State) -> float:
-        return 2 * math.pi * state.pole_counts / self._cart.information.pole_counts_per_turn
 
 
 def _spread(window: deque[tuple[int, float]]) -> float:
