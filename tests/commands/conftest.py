@@ -1,5 +1,12 @@
-"""Runs that several test files share: two trainings (one interrupted), an identification, a fine-tuning."""
+"""Runs that several test files share: two trainings (one interrupted), an identification, a fine-tuning.
 
+One worker of the tests makes each; every worker has a copy of its own.
+"""
+
+import os
+import pickle
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -13,26 +20,55 @@ from command_line import (
     no_pictures,
     prints_only_progress,
 )
+from filelock import FileLock
+
+Make = Callable[[str, Callable[[Path], Outcome]], tuple[Path, Outcome]]
 
 
 @pytest.fixture(scope="session")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def once(tmp_path_factory: pytest.TempPathFactory) -> Make:
+    """Return a function that lets one worker fill a folder, and returns a copy and the outcome."""
+    own = tmp_path_factory.getbasetemp()
+    shared = (own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / "shared"
+    shared.mkdir(exist_ok=True)
+
+    def once(name: str, make: Callable[[Path], Outcome]) -> tuple[Path, Outcome]:
+        folder, ended = shared / name, shared / f"{name}.pickle"
+        with FileLock(shared / f"{name}.lock"):
+            if not ended.exists():
+                shutil.rmtree(folder, ignore_errors=True)
+                folder.mkdir()
+                ended.write_bytes(pickle.dumps(make(folder)))
+        copy = shutil.copytree(folder, tmp_path_factory.mktemp(name), dirs_exist_ok=True)
+        return copy / "run", pickle.loads(ended.read_bytes())
+
+    return once
+
+
+@pytest.fixture(scope="session")
+def trained(once: Make) -> Path:
     """The run folder of a tiny training; with two actions its agent always moves the cart."""
-    folder = tmp_path_factory.mktemp("trained")
-    done = in_process("train", *TINY, "actions=two", "hydra.run.dir=run", folder=folder)
-    assert done.code == 0, done.err
-    assert prints_only_progress(done), done
-    return folder / "run"
+
+    def make(folder: Path) -> Outcome:
+        done = in_process("train", *TINY, "actions=two", "hydra.run.dir=run", folder=folder)
+        assert done.code == 0, done.err
+        assert prints_only_progress(done), done
+        return done
+
+    return once("trained", make)[0]
 
 
 @pytest.fixture(scope="session")
-def interrupted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Outcome]:
+def interrupted(once: Make) -> tuple[Path, Outcome]:
     """The folder and the outcome of a tiny training that was interrupted after its first checkpoint."""
-    folder = tmp_path_factory.mktemp("stopped")
-    interrupt_after(folder / "run/checkpoints/resume.pt")
     longer = ("actions=two", "learning.transitions=2000000", "learning.evaluations=2000", "hydra.run.dir=run")
-    with no_pictures():
-        return folder / "run", in_process("train", *TINY, *longer, folder=folder)
+
+    def make(folder: Path) -> Outcome:
+        interrupt_after(folder / "run/checkpoints/resume.pt")
+        with no_pictures():
+            return in_process("train", *TINY, *longer, folder=folder)
+
+    return once("stopped", make)
 
 
 @pytest.fixture(scope="session")
@@ -44,19 +80,25 @@ def stopped(interrupted: tuple[Path, Outcome]) -> Path:
 
 
 @pytest.fixture(scope="session")
-def identified(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Outcome]:
+def identified(once: Make) -> tuple[Path, Outcome]:
     """The run folder and the outcome of an identification of an emulated cart."""
-    folder = tmp_path_factory.mktemp("identified")
-    done = in_process("identify", "plant=emulated", *IDENTIFICATION, "hydra.run.dir=run", folder=folder)
-    assert done.code == 0, done.err
-    return folder / "run", done
+
+    def make(folder: Path) -> Outcome:
+        done = in_process("identify", "plant=emulated", *IDENTIFICATION, "hydra.run.dir=run", folder=folder)
+        assert done.code == 0, done.err
+        return done
+
+    return once("identified", make)
 
 
 @pytest.fixture(scope="session")
-def tuned(trained: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Outcome]:
+def tuned(once: Make, trained: Path) -> tuple[Path, Outcome]:
     """The run folder and the outcome of a short fine-tuning on an emulated cart."""
-    folder = tmp_path_factory.mktemp("tuned")
-    with no_pictures():
-        done = in_process("finetune", f"run={trained}", *FINETUNING, "hydra.run.dir=run", folder=folder)
-    assert done.code == 0, done.err
-    return folder / "run", done
+
+    def make(folder: Path) -> Outcome:
+        with no_pictures():
+            done = in_process("finetune", f"run={trained}", *FINETUNING, "hydra.run.dir=run", folder=folder)
+        assert done.code == 0, done.err
+        return done
+
+    return once("tuned", make)

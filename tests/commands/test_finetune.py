@@ -82,9 +82,8 @@ def test_a_tuned_agent_is_evaluated_like_any_other(tuned: tuple[Path, Outcome], 
     assert done.code == 0, done.err
 
 
-@pytest.mark.parametrize(
-    "is_killed", [True, pytest.param(False, marks=pytest.mark.nightly, id="interrupted, its learner lost")]
-)
+@pytest.mark.nightly  # workflows/test_finetuning.py resumes one in every run
+@pytest.mark.parametrize("is_killed", [True, False], ids=["killed", "interrupted, its learner lost"])
 def test_a_run_continues_after_each_kind_of_interruption(
     is_killed: bool, trained: Path, tmp_path: Path
 ) -> None:

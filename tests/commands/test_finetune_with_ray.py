@@ -39,6 +39,7 @@ def head(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, "subpr
         started.wait()
 
 
+@pytest.mark.nightly
 def test_it_equals_one_on_a_single_machine_to_the_bit(
     trained: Path, tuned: tuple[Path, Outcome], head: tuple[str, "subprocess.Popen[bytes]"], tmp_path: Path
 ) -> None:

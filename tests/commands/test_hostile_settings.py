@@ -39,10 +39,16 @@ def assert_refused(command: str, word: str, folder: Path, named: str) -> None:
     assert contents(folder) == before
 
 
+def turns(command: str) -> Iterator[tuple[int, str]]:
+    """Every third group of a command, with its number; the first one depends on the command."""
+    groups = [group for other, group in GROUPS if other == command]
+    return ((number, group) for number, group in enumerate(groups) if (number + len(command)) % 3 == 0)
+
+
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_word_that_is_no_choice(command: str, tmp_path: Path) -> None:
-    """Each group gets one of the words, to save time, and each word meets several groups."""
-    for number, group in enumerate(group for other, group in GROUPS if other == command):
+    """Every third group gets one of the words, to save time; which ones depends on the command."""
+    for number, group in turns(command):
         value = WORDS[(number + len(command)) % len(WORDS)]
         assert_refused(command, f"{group}={value}", tmp_path, group)
 
@@ -68,13 +74,13 @@ FILES: dict[str, tuple[bytes, str]] = {  # content, part of the line
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_file_that_is_no_choice(command: str, tmp_path: Path) -> None:
-    """Each group gets one or two of the files, to save time, and each file meets several groups."""
+    """Every third group gets one or two of the files, to save time."""
     for name, (content, _) in FILES.items():
         (tmp_path / name).write_bytes(content)
     (tmp_path / "folder.yaml").mkdir()
     named = {name: part for name, (_, part) in FILES.items()}
     named |= {"folder.yaml": "is a folder", "no.yaml": "no such"}
-    for number, group in enumerate(group for other, group in GROUPS if other == command):
+    for number, group in turns(command):
         for name in [*named][(number + len(command)) % 12 :: 12]:
             assert_refused(command, f"{group}={name}", tmp_path, named[name])
 
@@ -89,11 +95,11 @@ def keys(tree: Mapping[str, Any], path: str = "") -> Iterator[str]:
 
 @pytest.mark.parametrize("command", SCHEMAS)
 def test_each_setting_takes_a_value_or_refuses_it_in_one_line(command: str) -> None:
-    """Found as given; a truth value is no number. Each setting of a command takes every other value."""
+    """Found as given; a truth value is no number. Each setting takes a third of the values."""
     schema, base = SCHEMAS[command], compose(command, REQUIRED.get(command, {}))
     lines: list[str] = []
     for number, key in enumerate(keys(base)):
-        for value in VALUES[(number + len(command)) % 2 :: 2]:
+        for value in VALUES[(number + len(command)) % 3 :: 3]:
             given: Any = value
             for name in reversed(key.split(".")):
                 given = {name: given}
@@ -114,9 +120,9 @@ def test_each_setting_takes_a_value_or_refuses_it_in_one_line(command: str) -> N
 
 @pytest.mark.parametrize("command", SCHEMAS)
 def test_settings_on_the_command_line(command: str, tmp_path: Path) -> None:
-    """A sixth of the words on each command, to save time, each on another setting."""
+    """A twelfth of the words on each command, to save time, each on another setting."""
     settings = [*keys(compose(command, REQUIRED.get(command, {})))]
-    for number, value in enumerate(SETTING_WORDS[[*SCHEMAS].index(command) % 6 :: 6]):
+    for number, value in enumerate(SETTING_WORDS[[*SCHEMAS].index(command) % 12 :: 12]):
         word = f"{settings[7 * number % len(settings)]}={value}"
         done, config = run(command, *required(command), word, folder=tmp_path)
         assert done.code in (0, 2), (word, done)

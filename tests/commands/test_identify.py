@@ -66,6 +66,7 @@ def test_what_is_written_can_be_read(run: Path) -> None:
     assert len(list((run / "figures").glob("*.png"))) == 6
 
 
+@pytest.mark.nightly
 def test_offline_is_as_online(run: Path, results: dict[str, Any], tmp_path: Path) -> None:
     done = in_process("identify", f"from={run}", *QUICK, "hydra.run.dir=again", folder=tmp_path)
     assert done.code == 0, done.err

@@ -129,7 +129,7 @@ def test_tensorboard_shows_the_score_first_and_describes_everything(trained: Pat
 
 
 @pytest.mark.usefixtures("without_pictures")
-@pytest.mark.parametrize("plant", ["simulated", "emulated"])
+@pytest.mark.parametrize("plant", ["simulated", pytest.param("emulated", marks=pytest.mark.nightly)])
 def test_an_evaluation_can_be_repeated(plant: str, trained: Path, tmp_path: Path) -> None:
     words = [f"run={trained}", "episodes=2", f"plant={plant}", *[COARSE] * (plant == "emulated")]
     for name in ("first", "second"):

@@ -52,6 +52,7 @@ def train(folder: Path, *overrides: str) -> tuple[dict, str]:
     return json.loads((folder / "metrics.json").read_text()), done.out + done.err
 
 
+@pytest.mark.nightly
 @pytest.mark.usefixtures("without_pictures")
 def test_the_balance_is_learned(tmp_path: Path) -> None:
     metrics, printed = train(tmp_path, "experiment=balance", *SHORT)

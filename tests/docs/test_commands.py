@@ -1,20 +1,27 @@
 """Every command of the pages in docs/ is one that the package takes: names, groups, keys and options exist.
 
 The README's commands are run by test_readme.py, those of the guides by test_guides.py, those of
-docs/extending.md by test_extending.py, the Python blocks by workflows/test_python_api.py and
-envs/test_torchrl_example.py. Here are those that need an extra, whose settings are composed, and scripts that
-take hours: their options exist. No block is left out.
+docs/extending.md by test_extending.py, the Python blocks by workflows/test_python_api.py,
+test_your_own_code.py and envs/test_torchrl_example.py. Here are those that need an extra, whose settings are
+composed, and scripts that take hours: their options exist. What a Python block imports exists. No block is
+left out.
 """
 
+import ast
 import re
 import shlex
 import subprocess
 import tomllib
+from contextlib import suppress
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import pytest
 from page_commands import NEED_EXTRAS, PAGES, ROOT, guide_commands, run_here
+
+from cartpole_rl.workflows.config import load_settings
 
 OTHER_PAGES = [*(page for page in PAGES if page.name != "extending.md"), ROOT / "README.md"]
 CHECKED = (
@@ -90,6 +97,23 @@ def test_the_script_and_its_options_exist(page: str, command: str) -> None:
 def test_blocks_are_found() -> None:
     pages = [page for page in OTHER_PAGES if BLOCKS.search(page.read_text())]
     assert len(pages) > 15
+
+
+@pytest.mark.parametrize("page", ["python-api", "your-own-code", "torchrl"])
+def test_what_a_python_block_imports_exists_and_its_settings_are_right(page: str) -> None:
+    """Settings that a block builds from its own variables are left to the tests that run it."""
+    text = (ROOT / f"docs/{page}.md").read_text()
+    names: dict[str, Any] = {}
+    for node in ast.walk(ast.parse("".join(re.findall(r"^```python\n(.*?)^```", text, re.M | re.S)))):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("cartpole_rl"):
+            for name in node.names:
+                names[name.name] = getattr(import_module(node.module), name.name)
+        elif isinstance(node, ast.Call) and getattr(node.func, "id", "") == "load_settings":
+            schema, words = node.args
+            assert isinstance(schema, ast.Name)
+            with suppress(ValueError):  # not literal
+                load_settings(names[schema.id], ast.literal_eval(words))
+    assert names
 
 
 @pytest.mark.parametrize("page", OTHER_PAGES, ids=lambda page: page.name)

@@ -60,14 +60,11 @@ def test_every_command_is_one_that_a_test_here_runs() -> None:
     assert {command.split()[0] for command in COMMANDS} == known
 
 
+@pytest.mark.nightly
 @pytest.mark.usefixtures("without_pictures")
 @pytest.mark.parametrize(
     "command",
-    [
-        pytest.param(command, marks=[pytest.mark.nightly] * (" -m " in command))
-        for command in listed("cartpole-train")
-        if "<run>" not in command
-    ],
+    [command for command in listed("cartpole-train") if "<run>" not in command],
 )
 def test_train(command: str, tmp_path: Path) -> None:
     budget = within(BUDGET, command)
@@ -79,6 +76,7 @@ def test_train(command: str, tmp_path: Path) -> None:
     assert len(runs) == (6 if " -m " in command else 1)
 
 
+@pytest.mark.nightly
 @pytest.mark.usefixtures("without_pictures")
 def test_resume(trained: Path) -> None:
     """A training is interrupted, resumed, and interrupted again."""
@@ -100,6 +98,7 @@ def num_evaluations(folder: Path) -> int:
     return len(history.read_text().splitlines()) if history.exists() else 0
 
 
+@pytest.mark.nightly
 @pytest.mark.usefixtures("without_pictures")
 @pytest.mark.parametrize("command", listed("cartpole-evaluate"))
 def test_evaluate(command: str, trained: Path, serial_port: Callable[[], str]) -> None:
@@ -136,6 +135,7 @@ def test_identify_train_on_it_and_model_it(trained: Path, serial_port: Callable[
     assert result.returncode == 0, result.stderr
 
 
+@pytest.mark.nightly
 @pytest.mark.usefixtures("without_pictures")
 def test_record_and_replay(trained: Path) -> None:
     (record,), (replay,) = listed("cartpole-record"), listed("cartpole-replay")
@@ -171,6 +171,7 @@ def test_distill(trained: Path) -> None:
     assert (trained / "runs/distill/readme/checkpoints/last.pt").exists()
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("command", [*listed("cartpole-report"), *listed("cartpole-export")])
 def test_pages(command: str, trained: Path) -> None:
     verb = command.split()[0].removeprefix("cartpole-")
@@ -187,6 +188,7 @@ def test_find_port_lists_the_ports(tmp_path: Path) -> None:
     assert "USB serial port" in result.stdout + result.stderr
 
 
+@pytest.mark.nightly
 def test_preflight(tmp_path: Path, serial_port: Callable[[], str]) -> None:
     (command,) = listed("cartpole-preflight")
     result = run_here(command.replace("/dev/ttyUSB0", serial_port()), "plant.write_timeout=2", cwd=tmp_path)
@@ -204,6 +206,7 @@ def test_emulate() -> None:
         assert process.wait(timeout=100) in (0, 130)
 
 
+@pytest.mark.nightly
 def test_tensorboard_reads_the_runs(trained: Path) -> None:
     (command,) = listed("tensorboard")
     name, *words = command.split()

@@ -21,6 +21,7 @@ BLOCKS = re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(encoding="utf-8"),
 PRINTED = re.compile(r"^ *print\(.*\)  # (.*)$", re.M)
 
 
+@pytest.mark.nightly  # test_commands.py reads the blocks in every run
 @pytest.mark.usefixtures("without_pictures", "own_extensions")
 def test_every_recipe_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     load = configs.load_settings

@@ -70,14 +70,12 @@ def dying(driven: Driven) -> Host:
 @pytest.mark.parametrize(
     ("cart", "period_us"),
     [
-        ({}, 20_000),
         (LARGE, 20_000),
         (HEAVY, 100_000),
         (SLIPPERY, 5_000),
-        (SLIPPERY, 20_000),
         (SLIPPERY, 100_000),
     ],
-    ids=["default", "large", "heavy slow", "slippery fast", "slippery", "slippery slow"],
+    ids=["large", "heavy slow", "slippery fast", "slippery slow"],
 )
 @pytest.mark.parametrize("host", [outward, to_and_fro, pumping, dying])
 def test_no_host_drives_the_cart_against_a_stop(host, cart, period_us):
@@ -96,7 +94,7 @@ def test_no_host_drives_the_cart_against_a_stop(host, cart, period_us):
 
 
 @pytest.mark.parametrize("after", [0.1, 0.4])
-@pytest.mark.parametrize("cart", [{}, LARGE, HEAVY, SLIPPERY], ids=["default", "large", "heavy", "slippery"])
+@pytest.mark.parametrize("cart", [LARGE, SLIPPERY], ids=["large", "slippery"])
 @pytest.mark.parametrize("host", [outward, to_and_fro])
 def test_a_cart_whose_encoder_freezes_is_stopped_before_it_touches_a_stop(host, cart, after):
     driven, touched = ready(**cart)

@@ -41,6 +41,7 @@ def display() -> Iterator[str]:
         server.terminate()
 
 
+@pytest.mark.nightly
 def test_windows_show_the_pictures_and_gymnasiums_checker_accepts_both_modes(display: str) -> None:
     environment = os.environ | {"DISPLAY": display, "MPLBACKEND": "TkAgg"}
     command = [sys.executable, str(WINDOWS)]

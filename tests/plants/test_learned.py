@@ -108,7 +108,7 @@ def test_members_move_apart(make_learned: MakeLearned) -> None:
     assert not torch.allclose(first, second, atol=1e-3)
 
 
-@pytest.mark.nightly  # test_simulated.py compiles in every run
+@pytest.mark.nightly  # envs/test_compiled_environment.py compiles in every run
 def test_compiled_is_the_same(make_learned: MakeLearned) -> None:
     plain, compiled = (driven(make_learned(seed=3, compiled=each)) for each in (False, True))
     assert torch.allclose(plain, compiled, atol=1e-3)

@@ -2,7 +2,6 @@
 
 import math
 import pickle
-import shutil
 from collections.abc import Callable
 
 import pytest
@@ -219,15 +218,3 @@ def test_more_substeps_change_little(make_plant: MakePlant) -> None:
         ends.append(plant.true_state)
     assert abs(ends[0].x - ends[1].x).item() < 0.01
     assert abs(ends[0].theta - ends[1].theta).item() < math.radians(5)
-
-
-@pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler: install g++")
-def test_compiled_physics_is_the_same(make_plant: MakePlant) -> None:
-    plants = [make_plant(16, ranges=NOISY, start=ANYWHERE, compiled=compiled) for compiled in (False, True)]
-    for plant in plants:
-        plant.reset()
-        with torch.no_grad():
-            for row in random_motors(5, 16):
-                push(plant, *row.tolist())
-    plain, compiled = (torch.stack(plant.true_state) for plant in plants)
-    torch.testing.assert_close(compiled, plain, rtol=0, atol=1e-5)

@@ -47,8 +47,8 @@ FINETUNING = (
     "compile=false",
 )
 TRUTH = ("emulator.cart_viscous=1.1", "emulator.latency=0.012", "emulator.angle_offset=-0.01")
-QUICK = ("windows=80", "substeps=4", "carts=200")
-IDENTIFICATION = (*TRUTH, *QUICK)
+QUICK = ("windows=40", "substeps=4", "carts=200")
+IDENTIFICATION = (*TRUTH, COARSE, *QUICK)
 DISTILLATION = tuple(
     f"distillation.{name}={value}"
     for name, value in {"carts": 8, "rounds": 2, "periods": 5, "updates": 3, "batch_size": 16}.items()

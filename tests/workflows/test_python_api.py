@@ -1,4 +1,7 @@
-"""Every code block of docs/python-api.md runs, with settings of toy size."""
+"""Every code block of docs/python-api.md runs, with settings of toy size.
+
+docs/test_commands.py reads them in every run.
+"""
 
 import contextlib
 import io
@@ -66,29 +69,22 @@ def signal_handlers() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("signal_handlers", "without_pictures")
-@pytest.mark.parametrize("tunes", [False, pytest.param(True, marks=pytest.mark.nightly)])
-def test_every_block_runs(
-    tunes: bool, notebook: Path, make_plant: Callable, make_environment: Callable
-) -> None:
-    """In every run all but the fine-tuning, which commands/test_finetune.py has and which takes longest."""
+@pytest.mark.nightly
+def test_every_block_runs(notebook: Path, make_plant: Callable, make_environment: Callable) -> None:
     record_shaken_carts(notebook / "recordings", make_plant, make_environment)
     names: dict[str, Any] = {"__name__": "notebook"}
     printed = []
     for block in BLOCKS:
-        if not tunes and "import finetune" in block:
-            compile(block, PAGE.name, "exec")
-            continue
         with contextlib.redirect_stdout(io.StringIO()) as output:
             exec(compile(block, PAGE.name, "exec"), names)
         printed.append(output.getvalue())
     runs = {path.parent.relative_to("runs").as_posix() for path in Path("runs").glob("*/*/provenance.json")}
     commands = {"train", "evaluate", "record", "replay", "model", "identify", "report", "export", "distill"}
-    commands |= {"import", *["finetune"] * tunes}
+    commands |= {"import", "finetune"}
     assert runs == {f"{command}/first" for command in commands} | {"evaluate/on_model"}
     assert len(list(Path("runs/record/first/recordings").glob("*.csv"))) == 2
-    if tunes:
-        comparison = json.loads(Path("runs/finetune/first/comparison.json").read_text())
-        assert f"kept: {comparison['kept']}" in "".join(printed)
+    comparison = json.loads(Path("runs/finetune/first/comparison.json").read_text())
+    assert f"kept: {comparison['kept']}" in "".join(printed)
     assert "The cart is ready." in "".join(printed)
     assert "cos_theta" in "".join(printed)
     with pytest.raises(SystemExit, match=str(128 + signal.SIGTERM)):
