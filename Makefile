@@ -11,7 +11,6 @@ lint:
 
 types:
 	$(BIN)/mypy
-	$(BIN)/mypy scripts/thesis
 
 floors:
 	$(BIN)/lint-imports
