@@ -119,10 +119,11 @@ class Firmware:
         lever_um: int = LEVER,
         hardware: Hardware | None = None,
         samples: int = SAMPLES,
+        look_us: int = 0,
     ) -> None:
         """`delay_us` returns a command's latency; homing sets the pole's zero `zero_error` counts too low.
 
-        `lever_um` and `samples` are those of `TrackLimits`; `hardware` is ip02's if it is None.
+        `lever_um`, `samples` and `look_us` are those of `TrackLimits`; `hardware` is ip02's if it is None.
         """
         self._hardware = hardware = hardware or nominal_hardware()
         self.period_us = PERIOD_US
@@ -134,7 +135,7 @@ class Firmware:
         self._delay_us = delay_us
         self._zero_error = zero_error
         self._line = MotorLine()
-        self._limits = TrackLimits(hardware, lever_um, samples)
+        self._limits = TrackLimits(hardware, lever_um, samples, look_us)
         self._limited = False  # the limits have changed the motor value since the newest tick
         self._homing: Generator[int, Reading, Zeros] | None = None
         self._waited_us = 0  # since homing read the counts

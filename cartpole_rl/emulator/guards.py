@@ -184,10 +184,13 @@ def lever_um(numbers: Mapping[str, float]) -> int:
 class TrackLimits:
     """The limits of one cart. `blocked` and `brake` are directions: 1 right, -1 left, 0 none."""
 
-    def __init__(self, hardware: Hardware, lever: int = LEVER, samples: int = SAMPLES) -> None:
+    def __init__(
+        self, hardware: Hardware, lever: int = LEVER, samples: int = SAMPLES, look_us: int = 0
+    ) -> None:
         """`lever` is m_p l / (m_c + m_p) in um, with l from the pivot to the pole's centre of mass.
 
-        The speed is that over so many `samples`: few where they are far apart.
+        The speed is that over so many `samples`: few where they are far apart. `look_us` lie between two
+        looks where that is more than REACTION_US allows for.
         """
         self.soft = nearest_count(micrometres(hardware.soft_limit), hardware)  # counts inside a stop
         self.hard = nearest_count(micrometres(hardware.hard_limit), hardware)  # counts inside a stop
@@ -199,7 +202,7 @@ class TrackLimits:
         self._braking = round(1e6 * hardware.braking)  # um/s^2
         self.blocked = 0  # direction in which motor values are held at 0
         self.brake = 0  # direction of the full motor value that brakes the cart
-        self._lever = lever
+        self._lever, self._look_us = lever, look_us
         self._us: deque[int] = deque(maxlen=samples)
         self._carts: deque[int] = deque(maxlen=samples)
         self._poles: deque[int] = deque(maxlen=samples)
@@ -284,7 +287,7 @@ class TrackLimits:
             counts = max(counts, half_span)
         left = (half_span - self.hard - counts) * self._nanometres // 1000  # um
         shake = 2 * self._lever * turning * turning // (fast * fast)
-        lag_us = (self._us[-1] - self._us[0]) // 2 + REACTION_US
+        lag_us = (self._us[-1] - self._us[0]) // 2 + REACTION_US + self._look_us
         if self.brake == -direction:
             lag_us += RELEASE_US
         needed = size * lag_us // 1_000_000 + size * size // (2 * self._braking)

@@ -20,8 +20,8 @@ void pole_a() { pole_counts += digitalRead(POLE_A) == digitalRead(POLE_B) ? -1 :
 void pole_b() { pole_counts += digitalRead(POLE_A) == digitalRead(POLE_B) ? 1 : -1; }
 
 void drive(int motor) {
-    analogWrite(RIGHT, motor > 0 ? motor : 0);
-    analogWrite(LEFT, motor < 0 ? -motor : 0);
+    analogWrite(motor > 0 ? LEFT : RIGHT, 0); /* first, so that both are never on */
+    analogWrite(motor > 0 ? RIGHT : LEFT, abs(motor));
 }
 
 void setup() {

@@ -44,9 +44,11 @@ MOST_BAD = 50  # damaged measurements more than whole ones
 CONFIRMED = 3  # implausible measurements in a row that fit each other: the board counts from elsewhere now
 SILENT_PERIODS = 3  # control periods without a measurement, after which the motor is off
 STOPS = 3  # lines that stop a board; the first may be damaged
-STOPPING = 1.0  # s that a cart which does not stop at the value 0 is given to stop
-STANDS = 0.005  # m/s
+STOPPING = 2.0  # s that a cart which does not stop at the value 0 is given to stop
+STANDS = 1e-3  # m/s, of a cart whose speed is known from what was sent alone
+STANDS_US, STANDS_COUNTS = 500_000, 1  # a measured cart stands if its count moves by no more in this time
 SETTLING = 0.1  # s: how fast such a cart is braked
+EARLY_US = 50_000  # a measurement that would arrive this much before it was made has a damaged time
 LONGEST_STEP = 0.2  # s without a command, for which the last one counts
 BOARD_RESTS_US, BOARD_STANDS = 1_500_000, 1e-3  # us without more motion than this, m: its homing has ended
 BOARD_ZERO = 2e-3  # m: a board that stands so near its zero may home without moving
@@ -58,20 +60,29 @@ class BoardClock:
     """The board's clock in terms of this computer's, by the arrivals of its measurements.
 
     A measurement can arrive late but never early: the earliest arrival tells by how much the clocks differ.
-    So one that waited in a buffer is known to be old.
+    So one that waited in a buffer is known to be old. Between two measurements lies at least half of the
+    time `board_us` between two of the board, however late the first one came.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, board_us: int) -> None:
+        self._shortest = board_us // 2
         self._ahead: float | None = None
-        self._last = 0  # stamp, us
+        self._last = self._measured = 0  # stamp, us, and when it was made
+
+    def is_early(self, stamp_us: int, arrived_us: int) -> bool:
+        """Return True if a measurement would have arrived before it was made: its time is damaged."""
+        return self._ahead is not None and stamp_us + self._ahead > arrived_us + EARLY_US
 
     def measured_us(self, stamp_us: int, arrived_us: int) -> int:
         """Return when a measurement was made, us of this computer's clock, by its `stamp_us`."""
         ahead = float(arrived_us - stamp_us)
+        first = self._ahead is None
         if self._ahead is not None:
             ahead = min(ahead, self._ahead + LEAK * max(0, stamp_us - self._last))
         self._ahead, self._last = ahead, stamp_us
-        return round(stamp_us + ahead)
+        measured = round(stamp_us + ahead)
+        self._measured = measured if first else max(measured, self._measured + self._shortest)
+        return self._measured
 
 
 class StandIn(Firmware):
@@ -81,7 +92,7 @@ class StandIn(Firmware):
         self, settings: BoardSettings, hardware: Hardware, board_us: int, driver: Driver, lever: int
     ) -> None:
         """`board_us` is the time between two measurements, `lever` that of `TrackLimits`, um."""
-        super().__init__(lambda: 0, lever_um=lever, hardware=hardware, samples=SAMPLES)
+        super().__init__(lambda: 0, lever_um=lever, hardware=hardware, samples=SAMPLES, look_us=board_us)
         self._settings, self._driver, self._board_us = settings, driver, board_us
         self.board_homes = False  # the board moves the cart by itself
         self.every = math.ceil(SHORTEST_US / board_us)  # measurements a control period
@@ -109,6 +120,10 @@ class StandIn(Firmware):
     def wait(self, now_us: int) -> None:
         """Apply the rules of the clock: no measurement comes."""
         self._expire(now_us)
+
+    def recount(self) -> None:
+        """Let the board, which homes, count from elsewhere."""
+        self._reset_watches()
 
     def lose_pole(self) -> None:
         """Fault a driven cart whose pole is not measured any more."""
@@ -224,14 +239,20 @@ class MotorCommands:
             self._acceleration = 0.0
         return self._sign * (self._speed if self._sends == "speed" else self._acceleration)
 
-    def at_rest(self, now: float) -> float | None:
-        """Return the command that slows the cart to rest; None if it stands or the board's stop does it."""
+    def at_rest(self, now: float, stands: bool | None) -> float | None:
+        """Return the command that slows the cart to rest; None if it stands or the board's stop does it.
+
+        `stands` is what the newest counts say, None if nothing is measured.
+        """
+        if self._sends == "speed":
+            slowed = max(0.0, abs(self._speed) - self._size * min(now - self._now, LONGEST_STEP))
+            self._speed, self._acceleration, self._now = math.copysign(slowed, self._speed), 0.0, now
+            return self._sign * self._speed if slowed else None
         self._pass_time(now)
-        if self._sends != "acceleration":
+        if stands is None:
+            stands = abs(self._speed) < STANDS
+        if self._sends == "value" or stands or not (self._speed or self._acceleration):
             self._speed = self._acceleration = 0.0
-            return None
-        if abs(self._speed) < STANDS:
-            self._acceleration = 0.0
             return None
         self._acceleration = -math.copysign(min(self._size, abs(self._speed) / SETTLING), self._speed)
         return self._sign * self._acceleration
@@ -259,7 +280,6 @@ class Bridge:
         self._lock = Lock()
         self._commands = MotorCommands(settings)
         self._failure: CartPoleError | None = None
-        self._clock = BoardClock()
         self._booted = time.monotonic()
         self._control_period = control_period
         self._channel: Channel | None = None
@@ -292,13 +312,13 @@ class Bridge:
             )
         self._driver.open()
         self._driver.stop()
-        self._board_us = board_us = self._learn_period()
+        board_us = self._learn_period()
         if board_us > LONGEST_US:
             raise LinkError(
                 f"{self._settings.port} measures every {board_us / 1e3:.0f} ms; a pole needs at least one "
                 f"every {LONGEST_US / 1e3:.0f} ms: let the board send more often, or check time_unit"
             )
-        self._stand_in = self._new_stand_in()
+        self._begin(board_us)
         if self._control_period is not None:
             self._stand_in.check_period(round(1e6 * self._control_period))
 
@@ -420,7 +440,9 @@ class Bridge:
             return self._accept(new, pole, now_us)
         if new.us == last.us:
             return self._refuse(f"its time stands still at {new.us} us")
-        if self._fits(last, new, now_us - self._arrived_us, len(self._suspects)):
+        if not self._clock.is_early(us, now_us) and self._fits(
+            last, new, now_us - self._arrived_us, len(self._suspects)
+        ):
             if carried is None:
                 self._stand_in.lose_pole()
             self._pole += self._turned(last, new)
@@ -430,7 +452,12 @@ class Bridge:
         self._suspects.append(new)
         if len(self._suspects) < CONFIRMED:
             return self._refuse(f"its numbers jump: {last}, then {new}")
-        self._restart()
+        assert last.us is not None
+        if self._stand_in.board_homes and us > last.us:
+            self._stand_in.recount()
+            self._recent.clear()
+        else:
+            self._begin(self._board_us)
         self._pole = new.pole
         return self._accept(new, pole, now_us)
 
@@ -462,10 +489,14 @@ class Bridge:
         self._counts, self._stamp_us = (new.cart, self._pole), new.us
         self._potentiometer.accept(reading, new.us)
         self._measured_us = self._clock.measured_us(new.us, now_us)
-        moved = not self._recent or new.cart != self._recent[-1][1]
+        if self._recent:
+            self._at_rest.add(new.cart, max(1, new.us - self._recent[-1][0]))
+        before = self._recent[-1][1] if self._recent else None
         self._recent.append((new.us, new.cart))
-        if moved:
-            self._commands.measured(self._cart_speed, now_us * 1e-6)
+        if new.cart != before:
+            if before is not None:
+                self._commands.measured(self._cart_speed(new, before), now_us * 1e-6)
+            self._changed_us = new.us
         return True
 
     def _refuse(self, why: str) -> bool:
@@ -473,15 +504,15 @@ class Bridge:
         self._driver.why_bad = why
         return False
 
-    def _restart(self) -> None:
-        """Begin anew, not homed: the board has restarted, or counts something else now."""
-        self._stand_in = self._new_stand_in()
-        self._clock, self._measured = BoardClock(), 0
+    def _begin(self, board_us: int) -> None:
+        """Begin, or begin anew, not homed: the board has restarted, or counts something else now."""
+        self._board_us = board_us
+        self._stand_in = StandIn(self._settings, self._hardware, board_us, self._driver, self._lever)
+        self._clock, self._measured = BoardClock(board_us), 0
         self._recent.clear()
+        self._at_rest = Window(STANDS_US)  # the cart's counts
+        self._changed_us = 0  # when the newest of them differed from the one before
         self._potentiometer.forget()
-
-    def _new_stand_in(self) -> StandIn:
-        return StandIn(self._settings, self._hardware, self._board_us, self._driver, self._lever)
 
     def _command(self, silent: bool = False) -> None:
         """Send what drives the board, or what stops it, also while no measurement comes (`silent`)."""
@@ -494,7 +525,7 @@ class Bridge:
             if not silent and not stand_in.is_idle(now_us):
                 self._send_value(self._commands.value(stand_in.motor, now_us * 1e-6))
                 return
-        slowing = self._commands.at_rest(now_us * 1e-6) if self._stops_left else None
+        slowing = self._commands.at_rest(now_us * 1e-6, self._stands(silent)) if self._stops_left else None
         if slowing is not None:
             self._send_value(slowing)
         elif self._stops_left:
@@ -507,13 +538,16 @@ class Bridge:
             raise LinkError(f"the command {value} is not finite")
         self._driver.send(value)
 
-    @property
-    def _cart_speed(self) -> float:
-        """The cart's speed by the newest measurements, m/s."""
-        if len(self._recent) < 2:
-            return 0.0
-        (first_us, first), (last_us, last) = self._recent[0], self._recent[-1]
-        return (last - first) * self._hardware.encoders.metres / max(1, last_us - first_us) * 1e6
+    def _stands(self, silent: bool) -> bool | None:
+        return None if silent else self._at_rest.spread <= STANDS_COUNTS
+
+    def _cart_speed(self, new: Measurement, before: int) -> float:
+        """Return the speed, m/s, of a cart whose count was `before`; a slow one changes it seldom."""
+        assert new.us is not None
+        since_us, since = self._recent[0]
+        if abs(new.cart - before) == 1 and self._changed_us < since_us:
+            since_us, since = self._changed_us, before
+        return (new.cart - since) * self._hardware.encoders.metres / max(1, new.us - since_us) * 1e6
 
     def _end(self) -> None:
         """Stop the board, whatever has happened; signals wait until then."""
@@ -530,9 +564,9 @@ class Bridge:
                 self._driver.close()
 
     def _slow_down(self) -> None:
-        deadline = time.monotonic() + STOPPING
+        deadline, silent = time.monotonic() + STOPPING, False
         while time.monotonic() < deadline:
-            slowing = self._commands.at_rest(self._now_us() * 1e-6)
+            slowing = self._commands.at_rest(self._now_us() * 1e-6, self._stands(silent))
             if slowing is None:
                 return
             self._send_value(slowing)
@@ -541,6 +575,7 @@ class Bridge:
                 measurement = self._driver.read(self._board_us * 1e-6)
             except Exception:  # the speed then follows from what was sent
                 time.sleep(self._board_us * 1e-6)
+            silent = measurement is None
             if measurement is not None:
                 self._take(measurement, self._now_us())
 

@@ -256,6 +256,7 @@ class Connection:
         kind: type[Answer],
         fits: Callable[[Answer], bool] = lambda answer: True,
     ) -> Answer | None:
+        overdue = False
         while True:
             for answer in self._answers:
                 if isinstance(answer, Ack | Nack) and (
@@ -266,10 +267,12 @@ class Connection:
                     raise refusal(answer)
                 if isinstance(answer, kind) and fits(answer):
                     return answer
-            if now() >= deadline and not self.link.waiting():
+            waiting = self.link.waiting()
+            if now() >= deadline and (overdue or not waiting):
                 return None
+            overdue = now() >= deadline  # what waits is read once more: this computer may have paused
             self._answers.clear()
-            self._read()
+            self._read(waiting)
 
     def _await_current(self, deadline: float) -> State:
         """The newest state that acknowledges the last frame; when that is overdue, the newest there is."""

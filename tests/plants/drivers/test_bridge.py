@@ -92,7 +92,7 @@ def test_it_is_driven_and_left_standing(tmp_path: Path) -> None:
         plant.close()
         lines = taken(tmp_path / "journal")
         assert any(line == "a=2.824" for _, line, _ in lines)
-        assert abs(last_speed(tmp_path / "journal")) < 0.02  # the acceleration 0 alone would let it roll
+        assert abs(last_speed(tmp_path / "journal")) < 0.001  # the acceleration 0 alone would let it roll
 
 
 @pytest.mark.nightly

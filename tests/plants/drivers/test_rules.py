@@ -76,8 +76,8 @@ class Playing(Bridge):
         chosen = settings(**given)
         self.played, self.now = Played(chosen, RIG.encoders), 0
         super().__init__(chosen, RIG, self.played, None, LEVER)
-        self._board_us, self._channel = PERIOD_US, Frames()  # type: ignore[assignment]
-        self._stand_in = self._new_stand_in()
+        self._channel = Frames()  # type: ignore[assignment]
+        self._begin(PERIOD_US)
 
     def _now_us(self) -> int:
         return self.now
@@ -123,6 +123,86 @@ def test_a_stepper_is_slowed_down_when_its_host_is_late(monkeypatch: pytest.Monk
     bridge.drive(0, monkeypatch)
     bridge.measure(4000, 4400)
     assert bridge.played.sent[-1] == pytest.approx(-10, rel=0.1)
+
+
+@pytest.mark.parametrize("latency", [0, 2])
+@pytest.mark.parametrize("speed", [-0.3, 0.012])
+def test_a_stepper_is_left_standing(speed: float, latency: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its board takes accelerations, and stops with the acceleration 0, at which it would keep its speed."""
+    bridge = Playing(sends="acceleration", full=12.0, fastest=2.0)
+    bridge.drive(0, monkeypatch)
+    x, asked = 0.0, [0.0] * (latency + 1)
+
+    def roll(periods: int) -> None:
+        nonlocal x, speed
+        for _ in range(periods):
+            stops = bridge.played.stops
+            bridge.measure(round(x / 25e-6))
+            asked.append(0.0 if bridge.played.stops > stops else (bridge.played.sent or [0.0])[-1])
+            if bridge.played.stops > stops:
+                bridge.played.sent.append(0.0)  # what a stop means to this board
+            acceleration = asked[-1 - latency]
+            x += speed * 0.01 + acceleration * 0.01**2 / 2
+            speed += acceleration * 0.01
+
+    roll(10)
+    bridge._stand_in.armed = False
+    roll(400)
+    assert abs(speed) < 2e-4  # m/s
+    sent, stops = len(bridge.played.sent), bridge.played.stops
+    roll(100)
+    assert (len(bridge.played.sent), bridge.played.stops) == (sent, stops)
+
+
+def test_a_stepper_that_takes_speeds_is_slowed_down_and_not_stopped_at_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    bridge = Playing(sends="speed", full=10.0, fastest=1.0)
+    bridge.measure(0)
+    bridge.drive(255, monkeypatch)
+    bridge.measure(*[0] * 6)
+    bridge.drive(0, monkeypatch)
+    bridge.played.sent.clear()
+    stops = bridge.played.stops
+    bridge.measure(*[0] * 8)
+    assert bridge.played.sent == pytest.approx([0.4, 0.3, 0.2, 0.1], abs=1e-6)
+    assert bridge.played.stops > stops
+
+
+@pytest.mark.parametrize("has_time", [True, False])
+def test_a_late_line_faults_no_cart(has_time: bool) -> None:
+    """One that came 9 ms late, or a second of lines that came 15 ms late, and then one that came in time."""
+    bridge = Playing(sends="value", full=255)
+    for number in range(200):
+        late = 15_000 * (has_time and 40 <= number < 140) + 9_000 * (number == 20)
+        bridge.now = number * PERIOD_US + late
+        cart = 40 * max(0, number - 12)
+        bridge._pass(Measurement(cart, 2048 + number % 2, number * PERIOD_US if has_time else None))
+        if number == 10:
+            bridge._stand_in.armed = bridge._stand_in.homed = True
+            bridge._stand_in._limits.release()
+    assert (bridge._stand_in.fault, bridge.played.bad) == (Fault.NONE, 0)
+
+
+def test_a_time_that_has_not_come_yet_is_damaged_and_costs_one_line() -> None:
+    bridge = Playing(sends="value", full=255)
+    bridge.measure(*range(10))
+    bridge._stand_in.homed = True
+    bridge.now += PERIOD_US
+    bridge._pass(Measurement(10, 0, bridge.now + 600_000))
+    assert bridge.played.bad == 1
+    assert bridge.measure(*range(11, 20)) == [True] * 9
+    assert bridge._stand_in.homed
+
+
+def test_a_board_that_homes_may_set_its_count() -> None:
+    bridge = Playing(homing="board", sends="acceleration", full=12.0)
+    bridge.measure(*range(-12000, -11000, 100))
+    stand_in = bridge._stand_in
+    stand_in.board_homes, sent = True, [*bridge.played.sent]
+    assert bridge.measure(0, 0, 0, 10) == [False, False, True, True]
+    assert bridge._stand_in is stand_in
+    assert bridge.played.sent == sent
 
 
 def test_a_count_that_is_set_elsewhere_ends_the_homing() -> None:
