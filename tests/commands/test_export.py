@@ -18,7 +18,9 @@ FILES = {
 }
 
 
-@pytest.mark.parametrize("form", FILES)
+@pytest.mark.parametrize(
+    "form", [pytest.param(form, marks=pytest.mark.nightly if form == "onnx" else ()) for form in FILES]
+)
 def test_it_writes_the_files_of_the_format(form: str, tmp_path: Path) -> None:
     if form == "onnx":
         pytest.importorskip("onnxscript", reason='onnxscript is missing: pip install "cartpole_rl[export]"')

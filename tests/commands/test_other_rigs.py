@@ -41,6 +41,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
+@pytest.mark.nightly  # test_its_firmware_has_its_numbers reads the same file
 def test_the_preflight_reads_its_file(folder: Path) -> None:
     done = in_process("preflight", "cart=lab.yaml", "plant=emulated", COARSE, folder=folder)
     assert (done.code, done.err) == (0, ""), done

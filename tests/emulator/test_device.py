@@ -7,7 +7,7 @@ import pytest
 pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
 
 from driven_cart import COARSE, OTHER_PHYSICS, Driven, check_homed, homed
-from firmwares import truth
+from firmwares import one_firmware, truth
 
 from cartpole_rl.emulator.device import CartDevice
 from cartpole_rl.emulator.settings import EmulatorSettings
@@ -216,6 +216,7 @@ def test_the_same_settings_send_the_same_bytes(base):
     assert trace() == base
 
 
+@one_firmware
 @pytest.mark.parametrize("name", OTHER)
 def test_another_value_sends_other_bytes(base, name):
     assert trace(**{name: OTHER[name]}) != base

@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
 
 from driven_cart import COARSE, Driven, check_homed, homed
-from firmwares import truth
+from firmwares import one_firmware, truth
 
 from cartpole_rl.emulator.device import CartDevice
 from cartpole_rl.emulator.firmware import BANNER
@@ -131,6 +131,7 @@ def test_homing_fails_with_a_frozen_encoder(encoder, fault):
     assert driven.flags == Flags.FAULTED
 
 
+@one_firmware
 @pytest.mark.parametrize(
     "settings", [{}, {"pole_mass": 0.233, "pole_com": 0.328, "pole_inertia": 8e-3}, {"start": "upright"}]
 )

@@ -6,7 +6,7 @@ scripts/fuzz/wire.py is the long version.
 import contextlib
 
 import pytest
-from firmwares import make_firmware, motors_over
+from firmwares import make_firmware, motors_over, one_firmware
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
@@ -44,6 +44,7 @@ def envelope(stuffed: bytes) -> Envelope | None:
     return None
 
 
+@one_firmware
 @given(streams())
 @settings(max_examples=150, deadline=None)
 def test_the_hosts_decoder_takes_any_bytes(stream):

@@ -124,8 +124,7 @@ def test_the_longest_track_is_searched_to_its_end() -> None:
     check_homes(EmulatorSettings(**COARSE).of_cart({"track_span": 6.0}))
 
 
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("period_us", [5_000, 20_000, 100_000])
+@pytest.mark.parametrize(("period_us", "seed"), [(5_000, 0), (20_000, 1), (100_000, 2)])
 def test_the_coarsest_encoders_are_fine_enough(period_us: int, seed: int) -> None:
     rig = hardware_of({"cart_nanometres_per_count": 600_000, "pole_counts_per_turn": 200})
     light = {"pole_viscous": 3e-4, "pole_coulomb": 1e-4}  # a bearing that leaves the braking to the cart

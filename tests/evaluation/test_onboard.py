@@ -13,7 +13,6 @@ from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.episodes import run_episodes
 from cartpole_rl.evaluation.metrics import same_as_host
 from cartpole_rl.evaluation.onboard import comparable, run_onboard_episodes
-from cartpole_rl.plants.serial.errors import RefusedError
 from cartpole_rl.tasks.episode import Ending, Episode
 from cartpole_rl.workflows.build import (
     TrainedAgent,
@@ -99,14 +98,6 @@ def test_periods_that_are_not_compared(
 ) -> None:
     compared = comparable(np.isin(np.arange(10), gaps), memory, ending)
     assert tuple(np.flatnonzero(~compared)) == left_out
-
-
-def test_a_board_without_a_policy_refuses() -> None:
-    with (
-        driven(None, onboard=True) as driving,
-        pytest.raises(RefusedError, match="refused START_POLICY: its board has no policy"),
-    ):
-        next(driving)
 
 
 def test_a_recurrent_agent_is_refused() -> None:

@@ -89,22 +89,6 @@ def test_the_true_cart_predicts_every_count(episodes: list[Episode], nominal: di
     assert np.abs(measured.numpy() / count - first.counts[:51]).max() < 0.6
 
 
-def test_a_fit_finds_the_cart(episodes: list[Episode], nominal: dict[str, float]) -> None:
-    fit = fit_cart(cut_windows(episodes, PERIOD), nominal, STEP, PERIOD)
-    found = fit.parameters
-    assert (fit.rms < [5e-5, 1e-3]).all()  # m, rad
-    force = 0.02 * 200 - 1  # N at motor value 200
-    gain = (found["force_linear"] * 200 + found["force_offset"]) / (found["cart_mass"] + found["pole_mass"])
-    assert gain == pytest.approx(force / 0.83, rel=0.02)
-    mass = (found["cart_mass"] + found["pole_mass"]) / 0.83
-    assert found["cart_viscous"] / mass == pytest.approx(1.2, rel=0.03)
-    assert found["cart_coulomb"] / mass == pytest.approx(0.35, rel=0.05)
-    assert found["latency"] == pytest.approx(0.013, abs=0.002)
-    assert found["motor_time_constant"] == pytest.approx(0.006, abs=0.003)
-    assert found["angle_offset"] == pytest.approx(0.008, abs=0.002)
-    assert found["force_asymmetry"] == pytest.approx(-0.08, abs=0.02)
-
-
 def test_a_fit_finds_another_pole(
     make_plant: MakePlant,
     make_environment: MakeEnvironment,

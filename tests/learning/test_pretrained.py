@@ -4,7 +4,6 @@ import json
 from pathlib import Path
 
 import pytest
-from command_line import COARSE, in_process
 
 import cartpole_rl
 from cartpole_rl.learning.checkpoints import load_agent
@@ -30,14 +29,3 @@ def test_a_file_of_that_name_comes_first(tmp_path: Path, monkeypatch: pytest.Mon
     mine.parent.mkdir(parents=True)
     mine.touch()
     assert find_agent(Path("pretrained/medium")) == mine
-
-
-@pytest.mark.usefixtures("without_pictures")
-def test_a_pretrained_agent_drives_an_emulated_cart(tmp_path: Path) -> None:
-    pytest.importorskip("mujoco", reason='mujoco is missing: pip install "cartpole_rl[emulator]"')
-    words = ("run=pretrained/medium", "plant=emulated", COARSE, "episodes=1", "hydra.run.dir=run")
-    done = in_process("evaluate", *words, folder=tmp_path)
-    assert done.code == 0, done.err
-    metrics = json.loads((tmp_path / "run/metrics.json").read_text())
-    assert metrics["episodes"][0]["score"] > 4000
-    assert metrics["ended_by"] == {"time": 1}

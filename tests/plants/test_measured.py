@@ -41,22 +41,23 @@ def drive(**emulator: Any) -> list[Episode]:
 @pytest.fixture(scope="module")
 def healthy() -> Episode:
     (episode,) = drive()
+    assert episode.ended_by == "time"
+    assert episode.score.sum() > 4000  # a pretrained agent drives an emulated cart
     return episode
 
 
-@pytest.mark.parametrize(("encoder", "column"), [("cart", 0), ("pole", 1)])
 def test_nothing_after_a_frozen_count_is_kept(
-    healthy: Episode, encoder: str, column: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    healthy: Episode, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Neither scored nor recorded. No firmware sees that the cart's count froze: the agent drives gently."""
-    (episode,) = drive(stuck_encoder=encoder, stuck_at=30.0)
+    (episode,) = drive(stuck_encoder="cart", stuck_at=30.0)
     steps = episode.steps
     assert 250 < steps < 280
     assert (episode.counts == healthy.counts[: steps + 1]).all()
-    assert episode.counts[-1, column] != episode.counts[-2, column]
+    assert episode.counts[-1, 0] != episode.counts[-2, 0]
     assert episode.score.sum() == healthy.score[:steps].sum()
     assert episode.ended_by == "fault"
-    assert f"the {encoder}'s count froze: the last " in caplog.text
+    assert "the cart's count froze: the last " in caplog.text
     assert episode_metrics(episode, 0.4)["steps"] == steps
     write_recording(tmp_path / "episode.csv", episode)
     assert read_recording(tmp_path / "episode.csv").steps == steps

@@ -12,6 +12,7 @@ from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.wire import Message, SetMotor
 
 KINDS: dict[str, type[Firmware] | type[CFirmware]] = {"python": Firmware, "c": CFirmware}
+one_firmware = pytest.mark.parametrize("each_firmware", ["python"], indirect=True)  # of `each_firmware`
 needs_compiler = pytest.mark.skipif(not any(map(shutil.which, COMPILERS)), reason="needs a C compiler")
 
 

@@ -132,6 +132,15 @@ def test_a_refusal_says_why(reason: int, words: str) -> None:
         assert len(peer.received) == began
 
 
+def test_a_board_without_a_policy_says_so() -> None:
+    with (
+        Refusing(StartPolicy, Reason.UNKNOWN_TYPE) as peer,
+        SerialCart(quick_settings(peer.port)) as cart,
+        pytest.raises(RefusedError, match="refused START_POLICY: its board has no policy"),
+    ):
+        cart.start_policy()
+
+
 def test_a_refusal_for_a_fault_is_a_fault() -> None:
     with Refusing(Start, Reason.FAULT_LATCHED) as peer, SerialCart(quick_settings(peer.port)) as cart:
         with pytest.raises(FaultError, match="a fault is latched: remove its cause"):
