@@ -1,6 +1,5 @@
 """Response of every command to signals that end it."""
 
-import errno
 import os
 import signal
 import subprocess
@@ -21,7 +20,7 @@ from hydra.core.utils import JobReturn
 from cartpole_rl import cli
 from cartpole_rl.cli import VERBS
 from cartpole_rl.command import run_command
-from cartpole_rl.exits import Terminated, one_line
+from cartpole_rl.exits import Terminated
 from cartpole_rl.signals import UNWINDING, RaiseOnce, ending_signals
 from cartpole_rl.workflows.find_port import FindPortConfig
 
@@ -94,16 +93,6 @@ def test_a_full_disk_ends_a_command_with_one_line(tmp_path: Path) -> None:
     done = in_process("find_port", folder=tmp_path, function=main)
     assert done.code == 1
     assert done.complaint.startswith("cartpole-find-port: a file was not written: No space left on dev")
-
-
-@pytest.mark.parametrize(
-    ("word", "remedy"),
-    [("seed=1", "make room, or give hydra.run.dir= a folder on another disk"), ("resume=run", "make room")],
-)
-def test_a_full_disk_has_a_remedy(word: str, remedy: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sys.argv", ["cartpole-train", word])
-    full = OSError(errno.ENOSPC, "No space left on device", "run/last.pt")
-    assert one_line(full, "train") == f"run/last.pt: No space left on device; {remedy}"
 
 
 def test_a_pipe_without_a_reader_ends_a_command_quietly() -> None:

@@ -25,11 +25,13 @@ def test_a_file_error_names_the_file_and_the_reason() -> None:
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])
-def test_a_full_disk_gets_a_remedy(number: int) -> None:
+def test_a_full_disk_gets_a_remedy(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
     remedy = "; make room, or give hydra.run.dir= a folder on another disk"
     assert one_line(OSError(number, "is full", "last.pt"), "train") == f"last.pt: is full{remedy}"
     unnamed = "a file was not written: is full"
     assert one_line(OSError(number, "is full"), "train") == f"{unnamed}{remedy}"
+    monkeypatch.setattr("sys.argv", ["cartpole-train", "resume=run"])  # its folder is given
+    assert one_line(OSError(number, "is full"), "train") == f"{unnamed}; make room"
 
 
 def test_other_errors_keep_their_first_line() -> None:

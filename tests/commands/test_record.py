@@ -18,6 +18,7 @@ def test_every_episode_of_an_agent_is_a_file(trained: Path, tmp_path: Path) -> N
     done = in_process("record", f"run={trained}", "episodes=3", "hydra.run.dir=run", folder=tmp_path)
     assert done.code == 0, done.err
     assert "run/recordings/ holds 3 episodes, guarded " in done.out
+    assert done.out.splitlines()[-1] == "cartpole-replay from=run"
     paths = sorted((tmp_path / "run/recordings").iterdir())
     assert [path.name for path in paths] == [f"episode_00{number}.csv" for number in range(3)]
     assert all(read_recording(path).steps > 1 for path in paths)
@@ -58,9 +59,8 @@ def test_the_baseline_knows_the_nominal_cart_and_not_the_simulated_one(tmp_path:
     assert abs(first[1].x[3] - first[1].x[0]) > 1.3 * abs(first[0].x[3] - first[0].x[0])
 
 
-@pytest.mark.parametrize("pole", ["both", "range"])
-def test_the_baseline_has_one_pole(pole: str, tmp_path: Path) -> None:
-    done = in_process("record", "run=lqr", f"pole={pole}", folder=tmp_path)
+def test_the_baseline_has_one_pole(tmp_path: Path) -> None:
+    done = in_process("record", "run=lqr", "pole=both", folder=tmp_path)
     assert done.code == 2
     assert "run=lqr takes one pole" in done.complaint
     assert "choose one, as pole=medium" in done.complaint

@@ -35,6 +35,10 @@ def test_the_same_cart_is_followed(recorded: Path, tmp_path: Path) -> None:
     assert last["windows"] < 20  # the last stretch of an episode is cut by its end
     assert (results["pole"], results["control_period_s"], len(results["recordings"])) == ("medium", 0.02, 2)
     assert "errors of 2 episodes, pole=medium" in done.out
+    assert done.out.splitlines()[-2:] == [
+        "run/replay.json and figures/replay.png are written; next:",
+        f"cartpole-model from={recorded}",
+    ]
     assert "warning: a pole" not in done.out
     assert (tmp_path / "run/figures/replay.png").stat().st_size > 10_000
     config = yaml.safe_load((tmp_path / "run/config.yaml").read_text())

@@ -21,13 +21,6 @@ def cart_encoder_frozen(counts: list[int], motors: list[int]) -> list[bool]:
     return [watch.frozen(count, motor, PERIOD) for count, motor in zip(counts, motors, strict=True)]
 
 
-def test_a_cart_count_is_frozen_after_a_long_push_each_way() -> None:
-    long = math.ceil(PUSH_US / PERIOD) + 1
-    motors = [255] * long + [-255] * long
-    answers = cart_encoder_frozen([7] * len(motors), motors)
-    assert answers == [False] * (2 * long - 1) + [True]
-
-
 @pytest.mark.parametrize("lasts", [3, 4, 5])
 def test_short_pushes_each_way_add_up(lasts: int) -> None:
     """The first period of a push does not count."""

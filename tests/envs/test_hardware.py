@@ -37,9 +37,14 @@ def course(env: CartPoleEnv, chosen: Tensor) -> TensorDict:
     return torch.stack(taken)
 
 
-@pytest.mark.parametrize("kind", ObservationKind)
 @pytest.mark.parametrize(
-    ("pole_length", "motors", "velocities", "positions"), [(True, 0, 0, 0), (False, 2, 1, 0), (True, 3, 0, 2)]
+    ("kind", "pole_length", "motors", "velocities", "positions"),
+    [
+        (kind, *others)
+        for kind, others in zip(
+            ObservationKind, ((True, 0, 0, 0), (False, 2, 1, 0), (True, 3, 0, 2)), strict=True
+        )
+    ],
 )
 def test_specs(
     simulated: Simulated, kind: str, pole_length: bool, motors: int, velocities: int, positions: int

@@ -1,11 +1,11 @@
 """With `CI` set nothing that tests need is missing; otherwise a skip says what to install."""
 
-import importlib
 import os
 import re
 import shutil
 import sys
 import sysconfig
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -34,10 +34,9 @@ def is_there(what: str) -> bool:
     if what == "g++":
         return shutil.which(what) is not None
     try:
-        importlib.import_module(what)
-    except ImportError:
+        return find_spec(what) is not None
+    except ValueError:  # `None` among the modules, as the test below has it
         return False
-    return True
 
 
 def require(what: str) -> None:
@@ -55,7 +54,7 @@ def test_requirements_of_tests_are_installed(what: str) -> None:
     require(what)
 
 
-@pytest.mark.parametrize("what", list(REMEDIES))
+@pytest.mark.parametrize("what", ["av", "g++", "Python.h"])
 def test_nothing_can_be_missing_in_ci(what: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setitem(sys.modules, what, None)
     monkeypatch.setenv("PATH", str(tmp_path))
