@@ -22,7 +22,6 @@ WRONG_TRAINING = [
     ("pole=medium,large", "pole=medium,large", "-m runs each"),
     ("seed", "seed", "key=value"),
     ("experiment medium", "experiment medium", "did you mean experiment=medium?"),
-    ("--seed=1", "--seed=1", "without dashes: seed=1"),
     ("learning.epsilon=0.5", "learning.epsilon=0.5", "give a list, as [0.5]"),
     ("learning.epsilon=[0.5]", "learning.epsilon: ", "value 2 is missing"),
     ("agent.mirrored=maybe", "agent.mirrored=maybe", "give true or false"),

@@ -1,11 +1,8 @@
 """A command's last lines say where its results are, by relative paths, and which command to run next."""
 
 import io
-import os
-import pty
 import shlex
 import sys
-import termios
 from pathlib import Path
 
 import hydra
@@ -14,7 +11,6 @@ from command_line import COARSE, Outcome, in_process
 from hydra_configs import shipped_choices
 
 from cartpole_rl.command import wrapped
-from cartpole_rl.terminal import progress_bar
 
 pytestmark = pytest.mark.usefixtures("without_pictures")
 SIMULATED = "cartpole-evaluate run=run plant=emulated"
@@ -57,19 +53,6 @@ def test_a_chosen_pole_is_kept(trained: Path) -> None:
     assert done.out.splitlines()[-1] == "cartpole-evaluate run=run plant=emulated emulator=large"
 
 
-def test_recordings_lead_to_a_replay_and_to_a_model(trained: Path) -> None:
-    words = ("run=run", "episodes=2", "hydra.run.dir=last_record")
-    *_, last = in_process("record", *words, folder=trained.parent).out.splitlines()
-    assert last == "cartpole-replay from=last_record"
-    compose(last)
-    words = (*shlex.split(last)[1:], "hydra.run.dir=last_replay")
-    replayed = in_process("replay", *words, folder=trained.parent)
-    *_, written, last = replayed.out.splitlines()
-    assert written == "last_replay/replay.json and figures/replay.png are written; next:"
-    assert last == "cartpole-model from=last_record"
-    compose(last)
-
-
 def test_a_fine_tuning_leads_to_an_evaluation_on_its_cart(tuned: tuple[Path, Outcome]) -> None:
     *_, written, last = tuned[1].out.splitlines()
     assert written.startswith("run/metrics.json, comparison.json, checkpoints/last.pt and recordings/ are")
@@ -93,19 +76,3 @@ def test_choices_are_wrapped_in_a_narrow_terminal_and_nowhere_else(monkeypatch: 
         "  reward: constant, cosine, linear_angle,",
         "    position, score, upright_bonus",
     ]
-
-
-def test_a_progress_bar_is_drawn_on_a_terminal_and_nowhere_else(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    progress_bar(3, "episodes").update()
-    assert capsys.readouterr().err == ""
-    reader, writer = pty.openpty()
-    termios.tcsetwinsize(writer, (24, 80))
-    with os.fdopen(writer, "w") as terminal:
-        monkeypatch.setattr(sys, "stderr", terminal)
-        with progress_bar(3, "episodes") as bar:
-            bar.update()
-        shown = ""
-        while "1/3" not in shown:  # the time limit of the test ends the wait otherwise
-            shown += os.read(reader, 65536).decode()

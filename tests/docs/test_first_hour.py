@@ -50,13 +50,6 @@ def minutes(sentence: str) -> float:
     return {"a": 1, "two": 2, "three": 3, "four": 4, "five": 5}[found[1]]
 
 
-def test_the_page_says_where_no_cart_is_needed() -> None:
-    assert block_lines(PAGE, "cartpole-emulate") == [
-        "cartpole-emulate emulator.clock=real",
-        "cartpole-emulate emulator.clock=real emulator.start=upright",
-    ]
-
-
 @pytest.mark.nightly
 def test_the_page_is_a_path(tmp_path: Path, serial_port: Callable[..., str]) -> None:
     """It takes ten minutes: an emulated cart with a real clock drives as long as a real one."""

@@ -1,6 +1,5 @@
 """The compiled part of TorchRL, sampling by priority, and a buffer restored to the bit."""
 
-import importlib
 from pathlib import Path
 
 import numpy as np
@@ -34,10 +33,6 @@ def seed() -> None:
     """Seed the generators that the samplers draw from."""
     np.random.seed(3)  # noqa: NPY002
     torch.manual_seed(3)
-
-
-def test_the_compiled_part_of_torchrl_fits_this_torch() -> None:
-    importlib.import_module("torchrl._torchrl")
 
 
 @pytest.mark.parametrize("kind", KINDS)

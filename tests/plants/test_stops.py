@@ -179,7 +179,6 @@ def host() -> Iterator[Callable[..., "subprocess.Popen[bytes]"]]:
         (signal.SIGKILL, "plain", "watchdog"),
         (signal.SIGSTOP, "plain", "watchdog"),
         (signal.SIGTERM, "unwinds", "STOP"),
-        (signal.SIGHUP, "unwinds", "STOP"),
         (signal.SIGINT, "plain", "STOP"),
     ],
 )
