@@ -33,10 +33,14 @@ pygments_dark_style = "github-dark"
 
 
 def contents(readme: str) -> str:
-    """Return a toctree for each row of the tables below "Read on", with the pages that the row links to."""
+    """Return a toctree for each row of the table below "Read on", and a first one of the other pages."""
+    first, _, table = readme.partition("\n## Read on")
+    rows = [("Start", first), *re.findall(r"^\| (\w+) \| (.*) \|$", table, re.M)]
     trees = []
-    for caption, links in re.findall(r"^\| (\w+) \| (.*) \|$", readme.partition("\n## Read on")[2], re.M):
-        pages = re.findall(r"\(([\w./-]+)\.md\)", links)
+    for caption, links in rows:
+        pages = dict.fromkeys(re.findall(r"\(([\w./-]+)\.md\)", links))
+        if links is first:
+            pages = {page: None for page in pages if f"({page}.md)" not in table}
         trees.append("\n".join(["```{toctree}", ":hidden:", f":caption: {caption}", "", *pages, "```"]))
     return "\n\n".join(trees)
 
