@@ -189,8 +189,8 @@ class TrackLimits:
     ) -> None:
         """`lever` is m_p l / (m_c + m_p) in um, with l from the pivot to the pole's centre of mass.
 
-        The speed is that over so many `samples`: few where they are far apart. `look_us` lie between two
-        looks where that is more than REACTION_US allows for.
+        The speed is that over so many `samples`: few where they are far apart. `look_us` is the time between
+        two looks, 0 where they are 1 ms apart, which REACTION_US includes.
         """
         self.soft = nearest_count(micrometres(hardware.soft_limit), hardware)  # counts inside a stop
         self.hard = nearest_count(micrometres(hardware.hard_limit), hardware)  # counts inside a stop

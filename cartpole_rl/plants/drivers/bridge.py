@@ -21,7 +21,7 @@ from operator import index
 from statistics import mean, median
 from threading import Lock, Thread
 
-from cartpole_rl.emulator.firmware import LARGEST_MOTOR, Firmware
+from cartpole_rl.emulator.firmware import LARGEST_MOTOR, WATCHDOG_PERIODS, Firmware
 from cartpole_rl.emulator.guards import FASTEST_CART, FASTEST_POLE, LONGEST_US, SHORTEST_US
 from cartpole_rl.emulator.homing import Homing, HomingError, Reading, Window, Zeros, find_hanging
 from cartpole_rl.emulator.link import Channel
@@ -46,9 +46,10 @@ SILENT_PERIODS = 3  # control periods without a measurement, after which the mot
 STOPS = 3  # lines that stop a board; the first may be damaged
 STOPPING = 2.0  # s that a cart which does not stop at the value 0 is given to stop
 STANDS = 1e-3  # m/s, of a cart whose speed is known from what was sent alone
-STANDS_US, STANDS_COUNTS = 500_000, 1  # a measured cart stands if its count moves by no more in this time
+STANDS_US, STANDS_COUNTS = 500_000, 1  # a measured cart stands if its count stays so near one for this time
 SETTLING = 0.1  # s: how fast such a cart is braked
-EARLY_US = 50_000  # a measurement that would arrive this much before it was made has a damaged time
+EARLY_US = 50_000  # a time stamp that lies so far after the arrival is damaged
+MOST_AHEAD_US = 2_000_000  # of a measured time, before the board is taken for a faster one than at first
 LONGEST_STEP = 0.2  # s without a command, for which the last one counts
 BOARD_RESTS_US, BOARD_STANDS = 1_500_000, 1e-3  # us without more motion than this, m: its homing has ended
 BOARD_ZERO = 2e-3  # m: a board that stands so near its zero may home without moving
@@ -60,8 +61,8 @@ class BoardClock:
     """The board's clock in terms of this computer's, by the arrivals of its measurements.
 
     A measurement can arrive late but never early: the earliest arrival tells by how much the clocks differ.
-    So one that waited in a buffer is known to be old. Between two measurements lies at least half of the
-    time `board_us` between two of the board, however late the first one came.
+    So one that waited in a buffer is known to be old. Two measurements count as at least half a board period
+    apart, even if they arrive together.
     """
 
     def __init__(self, board_us: int) -> None:
@@ -149,6 +150,7 @@ class StandIn(Firmware):
 
     def _carry_out(self, message: Message, now_us: int) -> None:
         super()._carry_out(message, now_us)
+        self._expires_us = min(self._expires_us, now_us + WATCHDOG_PERIODS * self.period_us)
         if isinstance(message, SetPeriod):
             self.every = self.check_period(message.period_us)
 
@@ -239,7 +241,7 @@ class MotorCommands:
             self._acceleration = 0.0
         return self._sign * (self._speed if self._sends == "speed" else self._acceleration)
 
-    def at_rest(self, now: float, stands: bool | None) -> float | None:
+    def slowing(self, now: float, stands: bool | None) -> float | None:
         """Return the command that slows the cart to rest; None if it stands or the board's stop does it.
 
         `stands` is what the newest counts say, None if nothing is measured.
@@ -278,7 +280,6 @@ class Bridge:
         self._lever = lever
         self._settings, self._hardware, self._driver = settings, hardware, driver
         self._lock = Lock()
-        self._commands = MotorCommands(settings)
         self._failure: CartPoleError | None = None
         self._booted = time.monotonic()
         self._control_period = control_period
@@ -293,6 +294,8 @@ class Bridge:
             raise ConfigError(f"plant.pole_range covers the whole turn of {turn} counts: leave it out")
         self._potentiometer = Potentiometer(*(settings.pole_range or (-MOST, MOST)), turn)
         self._recent: deque[tuple[int, int]] = deque(maxlen=SAMPLES)  # us and cart count of the newest
+        self._changed_us = 0  # when the cart's count last changed
+        self._place = self._place_us = 0  # the count about which the cart stands, and since when
         self._measured = 0  # of the control period
         self._stops_left = STOPS  # whatever the board did before
 
@@ -411,6 +414,10 @@ class Bridge:
             if silent > LATE_PERIODS * self._board_us * 1e-6:
                 self._command(silent=silent > SILENT_PERIODS * self._stand_in.period_us * 1e-6)
             return
+        if self._measured_us > now_us + MOST_AHEAD_US:
+            raise LinkError(
+                f"{self._settings.port} measures far more often than when it was opened; connect it again"
+            )
         if self._measured:  # within a control period
             self._stand_in.look(self._measured_us, *self._counts)
         else:
@@ -489,8 +496,8 @@ class Bridge:
         self._counts, self._stamp_us = (new.cart, self._pole), new.us
         self._potentiometer.accept(reading, new.us)
         self._measured_us = self._clock.measured_us(new.us, now_us)
-        if self._recent:
-            self._at_rest.add(new.cart, max(1, new.us - self._recent[-1][0]))
+        if not self._recent or abs(new.cart - self._place) > STANDS_COUNTS:
+            self._place, self._place_us = new.cart, new.us
         before = self._recent[-1][1] if self._recent else None
         self._recent.append((new.us, new.cart))
         if new.cart != before:
@@ -510,24 +517,28 @@ class Bridge:
         self._stand_in = StandIn(self._settings, self._hardware, board_us, self._driver, self._lever)
         self._clock, self._measured = BoardClock(board_us), 0
         self._recent.clear()
-        self._at_rest = Window(STANDS_US)  # the cart's counts
-        self._changed_us = 0  # when the newest of them differed from the one before
+        self._commands = MotorCommands(self._settings)
         self._potentiometer.forget()
 
     def _command(self, silent: bool = False) -> None:
         """Send what drives the board, or what stops it, also while no measurement comes (`silent`)."""
         stand_in, now_us = self._stand_in, self._now_us()
         if stand_in.board_homes:
+            self._commands = MotorCommands(self._settings)  # what was sent before counts no more
             self._stops_left = STOPS  # for a homing that is ended
             return
         if stand_in.is_active:
             self._stops_left = STOPS
             if not silent and not stand_in.is_idle(now_us):
-                self._send_value(self._commands.value(stand_in.motor, now_us * 1e-6))
+                if stand_in.homing and not stand_in.motor and self._settings.sends == "speed":
+                    value = self._commands.slowing(now_us * 1e-6, None) or 0.0  # 0 would keep the speed
+                else:
+                    value = self._commands.value(stand_in.motor, now_us * 1e-6)
+                self._send_value(value)
                 return
-        slowing = self._commands.at_rest(now_us * 1e-6, self._stands(silent)) if self._stops_left else None
-        if slowing is not None:
-            self._send_value(slowing)
+        command = self._commands.slowing(now_us * 1e-6, self._stands(silent)) if self._stops_left else None
+        if command is not None:
+            self._send_value(command)
         elif self._stops_left:
             self._stops_left -= 1
             self._driver.stop()
@@ -539,7 +550,9 @@ class Bridge:
         self._driver.send(value)
 
     def _stands(self, silent: bool) -> bool | None:
-        return None if silent else self._at_rest.spread <= STANDS_COUNTS
+        if silent or self._last is None or self._last.us is None:
+            return None
+        return self._last.us - self._place_us >= STANDS_US
 
     def _cart_speed(self, new: Measurement, before: int) -> float:
         """Return the speed, m/s, of a cart whose count was `before`; a slow one changes it seldom."""
@@ -566,10 +579,10 @@ class Bridge:
     def _slow_down(self) -> None:
         deadline, silent = time.monotonic() + STOPPING, False
         while time.monotonic() < deadline:
-            slowing = self._commands.at_rest(self._now_us() * 1e-6, self._stands(silent))
-            if slowing is None:
+            command = self._commands.slowing(self._now_us() * 1e-6, self._stands(silent))
+            if command is None:
                 return
-            self._send_value(slowing)
+            self._send_value(command)
             measurement = None
             try:
                 measurement = self._driver.read(self._board_us * 1e-6)

@@ -267,10 +267,11 @@ class Connection:
                     raise refusal(answer)
                 if isinstance(answer, kind) and fits(answer):
                     return answer
+            late = now() >= deadline
             waiting = self.link.waiting()
-            if now() >= deadline and (overdue or not waiting):
+            if late and (overdue or not waiting):
                 return None
-            overdue = now() >= deadline  # what waits is read once more: this computer may have paused
+            overdue = late  # what waits is read once more: this computer may have paused
             self._answers.clear()
             self._read(waiting)
 

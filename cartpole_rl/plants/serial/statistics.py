@@ -14,7 +14,7 @@ LATENCY_SAMPLES = 65536  # the newest 22 minutes at 50 Hz
 MIDDLE = (0.01, 0.99)  # quantiles of the loop times
 
 
-def newest() -> deque[float]:
+def latency_queue() -> deque[float]:
     """Return an empty queue of the newest `LATENCY_SAMPLES` times in s. Its memory does not grow."""
     return deque(maxlen=LATENCY_SAMPLES)
 
@@ -29,8 +29,10 @@ class LinkStatistics:
     overtaken_frames: int = 0  # states that arrived after a newer one, and were dropped
     repeated_frames: int = 0  # states that arrived once more, and were dropped
     late_ticks: int = 0  # states passed over, or answered later than a period after they came
-    latency: deque[float] = field(default_factory=newest)  # s, from a state's arrival to its command's end
-    loop_times: deque[float] = field(default_factory=newest)  # s, see `latency_override`
+    latency: deque[float] = field(
+        default_factory=latency_queue
+    )  # s, from a state's arrival to its command's end
+    loop_times: deque[float] = field(default_factory=latency_queue)  # s, see `latency_override`
 
     def summary(self) -> dict[str, float]:
         """Return the counts, and the median, 99th and 99.9th percentile and maximum of the latency in ms.

@@ -169,6 +169,27 @@ def test_a_stepper_that_takes_speeds_is_slowed_down_and_not_stopped_at_once(
     assert bridge.played.stops > stops
 
 
+@pytest.mark.parametrize("board_homes", [True, False])
+def test_homing_begins_at_rest_whatever_speed_was_sent_before(
+    board_homes: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A stepper that takes speeds, whose homing begins before it was slowed down."""
+    bridge = Playing(sends="speed", full=4.0, fastest=1.0, homing="board" if board_homes else "hand")
+    bridge.measure(0)
+    bridge.drive(255, monkeypatch)
+    bridge.measure(*[0] * 30)
+    assert bridge.played.sent[-1] > 0.9
+    monkeypatch.setattr(StandIn, "motor", 0)
+    monkeypatch.setattr(StandIn, "homing", True)
+    monkeypatch.setattr(StandIn, "is_idle", lambda stand_in, now_us: False)
+    monkeypatch.setattr(StandIn, "tick", lambda *arguments: [])
+    bridge._stand_in.armed, bridge._stand_in.board_homes = False, board_homes
+    bridge.measure(*[0] * 40)
+    bridge._stand_in.board_homes = False
+    bridge.measure(0)
+    assert bridge.played.sent[-1] == 0
+
+
 @pytest.mark.parametrize("has_time", [True, False])
 def test_a_late_line_faults_no_cart(has_time: bool) -> None:
     """One that came 9 ms late, or a second of lines that came 15 ms late, and then one that came in time."""
