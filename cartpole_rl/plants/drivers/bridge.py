@@ -530,8 +530,8 @@ class Bridge:
         if stand_in.is_active:
             self._stops_left = STOPS
             if not silent and not stand_in.is_idle(now_us):
-                if stand_in.homing and not stand_in.motor and self._settings.sends == "speed":
-                    value = self._commands.slowing(now_us * 1e-6, None) or 0.0  # 0 would keep the speed
+                if stand_in.homing and not stand_in.motor:  # 0 would let a stepper keep its speed
+                    value = self._commands.slowing(now_us * 1e-6, self._stands(silent)) or 0.0
                 else:
                     value = self._commands.value(stand_in.motor, now_us * 1e-6)
                 self._send_value(value)

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from cartpole_rl.choices import choice
-from cartpole_rl.emulator.guards import LEVER, lever_um
+from cartpole_rl.emulator.guards import LEVER, TrackLimits, lever_um
 from cartpole_rl.emulator.homing import HomingError, Reading
 from cartpole_rl.emulator.process import until_stopped
 from cartpole_rl.errors import ConfigError, LinkError
@@ -169,6 +169,24 @@ def test_a_stepper_that_takes_speeds_is_slowed_down_and_not_stopped_at_once(
     assert bridge.played.stops > stops
 
 
+@pytest.mark.parametrize("sends", ["speed", "acceleration"])
+def test_a_stepper_that_rolls_is_slowed_down_when_its_homing_begins(
+    sends: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bridge = Playing(sends=sends, full=4.0, fastest=1.0, homing="hand")
+    bridge.measure(*range(0, 4000, 400))  # 1 m/s
+    bridge.drive(255, monkeypatch)
+    bridge.measure(*range(4000, 16_000, 400))
+    bridge._stand_in.armed = False
+    monkeypatch.setattr(StandIn, "motor", 0)
+    monkeypatch.setattr(StandIn, "homing", True)
+    monkeypatch.setattr(StandIn, "is_idle", lambda stand_in, now_us: False)
+    monkeypatch.setattr(StandIn, "tick", lambda *arguments: [])
+    before = bridge.played.sent[-1]
+    bridge.measure(16_000)
+    assert bridge.played.sent[-1] == (pytest.approx(before - 0.04) if sends == "speed" else -4)
+
+
 @pytest.mark.parametrize("board_homes", [True, False])
 def test_homing_begins_at_rest_whatever_speed_was_sent_before(
     board_homes: bool, monkeypatch: pytest.MonkeyPatch
@@ -203,6 +221,33 @@ def test_a_late_line_faults_no_cart(has_time: bool) -> None:
             bridge._stand_in.armed = bridge._stand_in.homed = True
             bridge._stand_in._limits.release()
     assert (bridge._stand_in.fault, bridge.played.bad) == (Fault.NONE, 0)
+
+
+def test_a_board_that_measures_far_more_often_than_at_first_is_refused() -> None:
+    bridge = Playing()
+
+    def measure_fast() -> None:
+        for number in range(3000):
+            bridge.now = number * PERIOD_US // 5
+            bridge._pass(Measurement(0, 0, None))
+
+    with pytest.raises(LinkError, match="x measures far more often than when it was opened"):
+        measure_fast()
+
+
+def test_the_brake_allows_for_the_time_to_the_next_line() -> None:
+    """The farther apart the lines, the earlier it begins: at 1 m/s a line of 20 ms costs 20 mm."""
+    begun = {}
+    for look_us in (0, 20_000):
+        limits = TrackLimits(RIG, 0, 3, look_us)
+        half = RIG.encoders.cart_counts(RIG.half_span)
+        for count in range(0, half, 40):  # 1 m/s, a sample a millisecond
+            limits.sample(1000 * (count // 40), count, 0)
+            limits.apply(1000 * (count // 40), count, 0, half, armed=True)
+            if limits.brake:
+                begun[look_us] = count * RIG.encoders.metres
+                break
+    assert begun[0] - begun[20_000] == pytest.approx(0.02, abs=0.002)
 
 
 def test_a_time_that_has_not_come_yet_is_damaged_and_costs_one_line() -> None:

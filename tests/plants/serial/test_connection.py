@@ -12,6 +12,7 @@ from cartpole_rl.errors import FaultError, LinkError, PlantError
 from cartpole_rl.plants.serial import connection
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.errors import RefusedError
+from cartpole_rl.plants.serial.link import SerialLink
 from cartpole_rl.wire import (
     Ack,
     Fault,
@@ -364,3 +365,13 @@ def test_on_a_lockstep_cart_no_time_passes_on_the_way() -> None:
         stopped = len(peer.messages(Stop))
         cart.start()
         assert len(peer.messages(Stop)) == stopped
+
+
+def test_a_device_that_never_pauses_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its bytes always wait, and none of them is an answer."""
+    with CartPeer() as peer, SerialCart(quick_settings(peer.port)) as cart:
+        monkeypatch.setattr(SerialLink, "waiting", lambda link: 1000)
+        monkeypatch.setattr(SerialLink, "receive", lambda link, waiting=0: [])
+        with pytest.raises(LinkError, match="did not answer STOP"):
+            cart.stop()
+        monkeypatch.undo()
