@@ -79,6 +79,12 @@ ONE_OF = {  # settings of a group, or of each of its parameters, of which one is
     "agent": ("target_tau", "target_period"),
     "randomization": ("absolute", "relative", "factor"),
 }
+IN_PERIODS = {  # settings in seconds: those in control periods that take precedence
+    "agent.horizon": "agent.gamma",
+    "agent.action_time": "agent.action_gap",
+    "learning.return_time": "learning.n_step",
+    "task.duration": "task.time_limit",
+}
 NO_CHOICE = "{0}=null: a group takes a choice; leave {0}=null out to take the default"
 EXTRAS = {  # of the package, that bring launchers and a sweeper
     "hydra/launcher/joblib": "joblib",
@@ -235,6 +241,11 @@ class _OwnChoices:
             names = [f"{group}.parameters.{name}" for name in values["parameters"]]
             if f"{group}.parameters" not in keys:
                 more += [f"++{name}=null" for name in names if name not in keys]
+        more += [
+            f"++{periods}=null"
+            for seconds, periods in IN_PERIODS.items()
+            if seconds in keys and periods not in keys and f"{seconds}=null" not in words
+        ]
         if kept := self._kept_by_emulator(keys):
             more.append(f"{KEPT}[{','.join(kept)}]")
         place = next((number for number, word in enumerate(words) if key_of(word)), 0)
@@ -356,8 +367,9 @@ def task_overrides(given: list[str] | ListConfig) -> list[str]:
 
 def is_completing(word: str) -> bool:
     """Return True for an override that no user gave: one that completes others."""
+    in_periods = (f"++{name}=null" for name in IN_PERIODS.values())
     return word.startswith((f"+{OWN}/", KEPT)) or bool(
-        re.fullmatch(r"\+\+\w+_friction\.parameters\.\w+=null", word)
+        word in in_periods or re.fullmatch(r"\+\+\w+_friction\.parameters\.\w+=null", word)
     )
 
 
@@ -382,7 +394,12 @@ def _alone(group: str, given: dict[str, Any]) -> dict[str, Any]:
     names = ONE_OF.get(group, ())
     if group == "randomization":
         return {name: _excluding(each, names) for name, each in given.items()}
-    return _excluding(given, names)
+    seconds = {f"{group}.{name}" for name, value in given.items() if value is not None}
+    in_periods = [name for of, name in IN_PERIODS.items() if of in seconds]
+    return {
+        **dict.fromkeys(name.removeprefix(f"{group}.") for name in in_periods),
+        **_excluding(given, names),
+    }
 
 
 def _excluding(given: Any, names: Iterable[str]) -> Any:

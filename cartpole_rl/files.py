@@ -44,10 +44,13 @@ def replacing(path: Path) -> Iterator[Path]:
 def claimed(folder: Path) -> Iterator[None]:
     """Make `folder` and keep it for this process: two that write into it would damage its files.
 
-    Raises ConfigError if another process has it. The claim ends with the process, however that ends. Windows
-    and file systems without locks know no claims.
+    Raises ConfigError if another process has it, or if it is a file. The claim ends with the process, however
+    that ends. Windows and file systems without locks know no claims.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError):
+        raise ConfigError(f"{folder}: this path, or a part of it, is a file; give another folder") from None
     if fcntl is None:
         yield
         return

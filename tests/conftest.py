@@ -8,8 +8,10 @@ itself still outlives them, as nohup is meant to. SIGPIPE is left alone: Python 
 restores it in children.
 
 Torch takes one thread, here and in children: the work of a test is small, and threads would wait busily.
+Python collects garbage seldom: with torch imported, it would take a sixth of the time of a small command.
 """
 
+import gc
 import os
 import signal
 from collections.abc import Callable, Iterator
@@ -42,6 +44,7 @@ CONF = Path(__file__).parents[1] / "conf"
 
 os.environ["OMP_NUM_THREADS"] = "1"  # of children
 torch.set_num_threads(1)
+gc.set_threshold(100_000, 50, 100)
 
 
 def outlive(number: int, frame: FrameType | None) -> None:

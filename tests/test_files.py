@@ -60,3 +60,10 @@ def test_a_folder_is_claimed_once_and_until_the_end(tmp_path: Path) -> None:
             pass
     with claimed(tmp_path / "run"):
         assert not list((tmp_path / "run").iterdir())
+
+
+def test_a_file_is_no_folder_to_claim(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    for folder in (tmp_path / "file", tmp_path / "file" / "run"):
+        with pytest.raises(ConfigError, match="this path, or a part of it, is a file; give another folder"):
+            claimed(folder).__enter__()

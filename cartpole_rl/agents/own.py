@@ -53,11 +53,14 @@ class OwnPolicy:
 
     def _result(self, observation: Tensor) -> Tensor:
         try:
-            return torch.as_tensor(self._function(observation.clone()))
+            given = torch.as_tensor(self._function(observation.clone()))
         except Exception as error:
             last = traceback.extract_tb(error.__traceback__)[-1]
             why = f"{type(error).__name__}: {' '.join(str(error).split())}"
             raise ConfigError(f"{self._name}: {why} ({last.filename}, line {last.lineno})") from error
+        if given.is_complex():
+            raise ConfigError(f"{self._name}: it gave complex numbers; give real ones")
+        return given.long() if given.dtype == torch.bool else given
 
     def _checked(self, actions: Tensor) -> dict[str, Tensor]:
         """Return actions [N]; those that are not finite are named by an action value that is not."""

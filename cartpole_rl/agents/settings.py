@@ -93,4 +93,10 @@ class AgentSettings(Settings):
     def _halves_for_the_mirror(self) -> "AgentSettings":
         if self.mirrored and any(size % 2 for size in self.hidden):
             raise ValueError(f"hidden {list(self.hidden)}: a mirrored network needs even numbers of units")
+        fewest = 4 if self.mirrored else 2
+        if self.layer_norm and any(size < fewest for size in self.hidden):
+            raise ValueError(
+                f"hidden {list(self.hidden)}: layer_norm makes a single unit constant"
+                f"{', and mirrored halves the units' if self.mirrored else ''}; give at least {fewest}"
+            )
         return self

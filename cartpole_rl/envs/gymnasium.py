@@ -52,6 +52,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from gymnasium.error import ResetNeeded
 from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
@@ -230,7 +231,9 @@ class CartPoleGymnasium(Carts, gymnasium.Env[Array, np.int64], EzPickle):
         return float32(first.observation), {}
 
     def step(self, action: np.int64) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        """One control period. Raises ConfigError for an action that does not exist."""
+        """One control period. Raises ConfigError for an unknown action, ResetNeeded before `reset`."""
+        if not hasattr(self.env.one_cart, "percept"):
+            raise ResetNeeded("call reset() before step()")
         now = self.env.one_cart.step(
             int(checked_actions(action, self.action_space, len(self.env.hardware.motors)))
         )

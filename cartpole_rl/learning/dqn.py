@@ -34,6 +34,7 @@ NEXT: tuple[NestedKey, ...] = ("next", "observation"), ("next", "reward"), ("nex
 COLLECTED: tuple[NestedKey, ...] = ("observation", "action", "guard", *NEXT, ("next", "done"))
 LEARNED: tuple[NestedKey, ...] = ("observation", "action", "steps_to_next_obs", *NEXT)
 OPTIMIZERS = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW}
+LARGEST_ERROR = 1e30  # squared: priorities of 32 bits, and their sum over any buffer, are then finite
 FEW_EPISODES = 1.5  # of each cart in a full buffer
 Scalars = dict[str, float]
 
@@ -184,7 +185,10 @@ class Training(Resumable):
         columns = [column.split(self.settings.batch_size) for column in self.gradient.columns(sample)]
         losses, norms, errors = zip(*map(self.update, zip(*columns, strict=True)), strict=True)
         if prioritized:
-            self.buffer.update_tensordict_priority(sample.set("td_error", torch.cat(errors)))
+            error = torch.cat(errors)
+            if not (largest := error.max().item()) < LARGEST_ERROR:
+                raise self.diverged(f"a squared error is {largest:g}")
+            self.buffer.update_tensordict_priority(sample.set("td_error", error))
         loss, norm = (torch.stack(each).mean().item() for each in (losses, norms))
         return {"learning/loss": loss, "learning/gradient_norm": norm, "learning/learning_rate": rate}
 
@@ -195,15 +199,18 @@ class Training(Resumable):
         """
         loss, norm, errors = self.gradient(batch)
         if not math.isfinite(loss.item() + norm.item()):
-            kept = "" if self.last_score is None else "earlier checkpoints are kept; "  # of evaluations
-            raise LearningError(
-                f"learning diverged after {self.transitions} transitions: the loss is {loss.item():g}, its "
-                f"gradient's norm {norm.item():g}; {kept}try a smaller "
-                f"optimizer.learning_rate than {self.optimizer_settings.learning_rate:g}"
-            )
+            raise self.diverged(f"the loss is {loss.item():g}, its gradient's norm {norm.item():g}")
         self.optimizer.step()
         self.agent.update_target()
         return loss, norm, errors
+
+    def diverged(self, how: str) -> LearningError:
+        """Return the error that ends a training."""
+        kept = "" if self.last_score is None else "earlier checkpoints are kept; "  # of evaluations
+        return LearningError(
+            f"learning diverged after {self.transitions} transitions: {how}; {kept}try a smaller "
+            f"optimizer.learning_rate than {self.optimizer_settings.learning_rate:g}"
+        )
 
     def run_evaluation(self) -> None:
         """Evaluate the greedy policy and report the episodes to the monitor."""

@@ -23,8 +23,8 @@ class BufferSettings(Settings):
     """Replay buffer; `alpha` and `beta` as in Schaul et al., "Prioritized experience replay", 2016."""
 
     kind: Literal["prioritized", "uniform"]
-    size: Count  # transitions
-    alpha: NonNegative  # TorchRL's priority is the squared error, so this acts doubled
+    size: Annotated[int, Field(ge=1, le=10**9)]  # transitions
+    alpha: Fraction  # TorchRL's priority is the squared error, so this acts doubled
     beta: tuple[Fraction, Fraction]  # from the first to the last update, linearly
     priority_eps: Positive
 

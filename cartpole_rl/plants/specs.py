@@ -1,7 +1,7 @@
 """The contract of every plant: its inputs and outputs, with shapes and types."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, Self, TypeVar
 
 import numpy as np
 import torch
@@ -9,7 +9,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from cartpole_rl.errors import PlantError
+from cartpole_rl.errors import ConfigError, PlantError
 from cartpole_rl.physics.dynamics import State
 from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.randomization.randomizer import Draws
@@ -83,6 +83,15 @@ class Plant(EnvBase):
             {key: Binary(shape=(carts, 1), dtype=torch.bool, device=device) for key in DONE_KEYS},
             shape=(carts,),
         )
+
+    def to(self, device: torch.device | str) -> Self:
+        """Return the plant if it is on `device`. Raises ConfigError for another one: it stays where it is."""
+        wanted = torch.device(device)
+        if wanted.type != self.device.type or wanted.index not in (None, self.device.index):
+            raise ConfigError(
+                f"the plant was made on {self.device}; make it on {device} in place of moving it"
+            )
+        return self
 
     @property
     def pole_length(self) -> torch.Tensor:

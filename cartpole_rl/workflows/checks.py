@@ -236,7 +236,7 @@ def check_resumable(program: str, resume: str, folder: Path) -> None:
     """Raise CartPoleError if cartpole-<program> cannot resume the run `resume` in `folder`."""
     run = Path(resume)
     check_program("resume", run, program)
-    if run.is_dir() and not folder.samefile(run):
+    if run.is_dir() and not (folder.exists() and folder.samefile(run)):
         raise ConfigError("resume continues in that run's own folder; leave out hydra.run.dir")
     if has_ended(run):
         raise ConfigError(

@@ -102,6 +102,7 @@ class CartLearner:
     """
 
     loop: Finetuning
+    models: Models  # of the simulated carts
     carts: torch.Tensor  # [P, SAMPLES], drawn from the newest fit, or as in training
     recorded: list[Episode]  # evaluations first
     is_fitted = True  # the simulator, to recordings of this cart
@@ -117,7 +118,7 @@ class CartLearner:
         self.config, self.training, self.settings, self.agent = config, training, settings, agent
         self.show = show
         models = training.models(training.plant)
-        self.candidates = [models]  # physics models to fit
+        self.candidates = [models]  # physics models to fit; those of the first fit alone, once there is one
         if models.cart_friction == "sigmoid":
             self.candidates.append(models._replace(cart_friction=CART_FRICTIONS.find("step")))
 
@@ -129,6 +130,7 @@ class CartLearner:
         """
         try:
             fit, models = self.fit_simulator(recorded)
+            self.candidates = [models]
             self.carts = self.draw_carts(fit)
         except NoWindowError as error:
             self.is_fitted = False
@@ -146,15 +148,17 @@ class CartLearner:
             self.carts = snapshot["carts"]
             self.is_fitted = snapshot.get("is_fitted", True)  # missing in earlier versions
             friction = CART_FRICTIONS.find(snapshot["cart_friction"])
-            self.prepare(recorded, self.candidates[0]._replace(cart_friction=friction))
+            models = self.candidates[0]._replace(cart_friction=friction)
+            if self.is_fitted:
+                self.candidates = [models]
+            self.prepare(recorded, models)
             self.loop.restore(snapshot)
 
     def snapshot(self) -> dict[str, Any]:
         """Return the state from which `restore` continues, to be saved at once."""
-        (models,) = self.candidates
         state = {
             "carts": self.carts,
-            "cart_friction": str(models.cart_friction),
+            "cart_friction": str(self.models.cart_friction),
             "is_fitted": self.is_fitted,
         }
         return {**self.loop.snapshot(), **state}
@@ -178,17 +182,24 @@ class CartLearner:
         An episode that no cart drives, as with a loose encoder, leaves the earlier fit.
         """
         try:
-            fit, _ = self.fit_simulator(self.recorded)
+            fit, models = self.fit_simulator(self.recorded)
+            self.candidates = [models]
             self.carts = self.draw_carts(fit)
         except RecordingError as error:
             self.show(f"the simulator stays as it is: {error}")
             return
         self.is_fitted = True
-        self.loop.simulate(self.randomizer())
+        if models == self.models:
+            self.loop.simulate(self.randomizer())
+            return
+        iteration = self.loop.iteration
+        self.prepare(self.recorded, models)
+        self.loop.iteration = iteration
+        self.loop.fill()
 
     def prepare(self, recorded: Sequence[Episode], models: Models) -> None:
         """Make the learning loop for `models`, with the transitions of the `recorded` episodes."""
-        self.candidates, self.recorded = [models], list(recorded)
+        self.models, self.recorded = models, list(recorded)
         self.loop = self.make_loop(models)
         for episode in recorded:
             self.loop.add(self.transitions(episode))

@@ -26,6 +26,12 @@ of_tensordict = TensorDictModule(network, in_keys=["observation"], out_keys=["ac
 def largest(observation):
     return observation.argmax(-1)
 
+def mask(observation):
+    return torch.nn.functional.pad(observation, (0, 1)) > 0
+
+def complex_values(observation):
+    return torch.zeros(2, 3, dtype=torch.complex64)
+
 def as_list(observation):
     return [int(row[1] > row[0]) for row in observation]
 
@@ -67,7 +73,7 @@ def chosen(run: str) -> list[int]:
         return choose(OwnPolicy(Path(run), MOTORS), TensorDict({"observation": observation}, [2])).tolist()
 
 
-@pytest.mark.parametrize("name", ["network", "of_tensordict", "largest", "as_list"])
+@pytest.mark.parametrize("name", ["network", "of_tensordict", "largest", "as_list", "mask"])
 def test_it_chooses_from_values_or_gives_the_action(name: str) -> None:
     assert chosen(f"own_policies:{name}") == [0, 1]
 
@@ -83,6 +89,7 @@ def test_what_is_not_finite_is_motor_value_0(name: str) -> None:
         ("high", "it chose 3; give integers from 0 to 2"),
         ("half", "it chose 0.5; give integers from 0 to 2"),
         ("flat", r"shape \[5\] for observations \[2, 2\]; give actions \[2\] or action values \[2, 3\]"),
+        ("complex_values", "it gave complex numbers; give real ones"),
         ("fails", r"RuntimeError: no weights \(.*own_policies.py, line 3\d\)"),
         ("Driver", "it is a class; give a function"),
         ("none", "has no 'none'"),

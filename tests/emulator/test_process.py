@@ -79,12 +79,11 @@ def test_a_whole_lockstep_session():
             assert bool(state.flags & Flags.WATCHDOG) == watchdog
 
 
-def test_lockstep_repeats_byte_for_byte_and_the_seed_matters():
-    first, again, other = drive(seed=3), drive(seed=3), drive(seed=4)
+def test_lockstep_repeats_byte_for_byte():
+    first, again = drive(seed=3), drive(seed=3)
     length = min(len(first), len(again))  # the last answers may not have arrived
     assert length > 10_000
     assert first[:length] == again[:length]
-    assert first[:length] != other[:length]
 
 
 @pytest.fixture(scope="module")
@@ -116,9 +115,8 @@ def test_one_undamaged_state_comes_for_each_frame_however_bad_the_cable():
     assert sum(gap > 1 for gap in gaps) > 50  # the cart ticked on while its states were lost
 
 
-@pytest.mark.parametrize("disturbance", ["frame_reordering", "frame_duplication"])
-def test_at_least_one_state_comes_for_each_frame(disturbance):
-    with emulator(**{disturbance: 0.3}) as host:
+def test_at_least_one_state_comes_for_each_frame():
+    with emulator(frame_reordering=0.3, frame_duplication=0.3) as host:
         for _ in range(150):
             host.send(Hello())
             host.state()

@@ -3,11 +3,13 @@
 import contextlib
 from collections.abc import Callable
 
+import pytest
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import check_env_specs
 
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
+from cartpole_rl.errors import ConfigError
 from cartpole_rl.plants.serial.plant import emulated_plant
 
 
@@ -21,6 +23,14 @@ def test_specs_hold_and_are_those_of_the_other_plant(
         assert specs(over_serial) == specs(over_simulated)
         check_env_specs(over_simulated)
         check_env_specs(over_serial)
+
+
+def test_no_environment_is_moved_to_another_device(simulated: Callable[..., CartPoleEnv]) -> None:
+    """Its specs would move, its carts would not."""
+    env = simulated()
+    assert env.to("cpu").device == env.device
+    with pytest.raises(ConfigError, match="the plant was made on cpu; make it on meta in place of moving it"):
+        env.to("meta")
 
 
 def specs(env: EnvBase) -> tuple:

@@ -229,6 +229,7 @@ WRONG = [
     ),
     *({"gamma": 1.0}, {"action_gap": 1.0}, {"loss": "l3"}, {"dropout": 0.1}),
     *({"hidden": [0]}, {"hidden": [15], "mirrored": True}),
+    *({"hidden": [16, 1]}, {"hidden": [2], "mirrored": True}),  # with layer_norm
 ]
 
 

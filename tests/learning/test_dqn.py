@@ -193,6 +193,18 @@ def test_learning_stops_at_the_first_loss_that_is_not_finite(
     assert all(map(torch.equal, training.gradient.weights, before))
 
 
+def test_learning_stops_at_an_error_that_is_too_large_for_a_priority(make_training: MakeTraining) -> None:
+    """The loss of such an error is finite."""
+    training = make_training(buffer={"kind": "prioritized"})
+    for _ in range(4):
+        training.iterate()
+    sample = training.buffer.sample()
+    sample["next", "reward"][0] = 1e20
+    training.sample = lambda: sample
+    with pytest.raises(LearningError, match=r"diverged after 320 transitions: a squared error is \S+; try a"):
+        training.iterate()
+
+
 def test_a_time_limit_does_not_end_the_world(make_training: MakeTraining) -> None:
     """With 1 a step and gamma = 0.5 every state is worth 2, since episodes of 6 steps are only cut short."""
     training = make_training(

@@ -109,6 +109,8 @@ def test_a_recording_has_what_the_agent_saw_and_tunes_it(
     torch.testing.assert_close(chunk["observation"][0], seen)
     assert all(value.isfinite().all() for value in chunk.values(True, True) if value.is_floating_point())
 
+    if kind != "history_length":  # the learner is the same for all
+        return
     learner, agent = make_learner([chunk], cart_share=0.5, **observation)
     before = {name: weight.clone() for name, weight in agent.named_parameters()}
     learner.round()

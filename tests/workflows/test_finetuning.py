@@ -335,16 +335,23 @@ def test_a_refit_that_fails_keeps_the_earlier_fit(
 def test_learning_begins_without_a_fit_and_takes_a_later_one(
     recorded: list[Episode], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The pole fell at once in each episode before the fine-tuning."""
+    """The pole fell at once in each episode before the fine-tuning. The first fit chooses the friction."""
     learner = new_learner()
+    candidates = [*learner.candidates]
     assert learner.start([recorded[0].part(0, 9)])["cart/score_in_simulation"] > 0
     line = capsys.readouterr().err.splitlines()[-1]
     told = "the simulator is not fitted yet, its carts are drawn as in training: no recording lasts 0.5 s"
     assert line == f"cartpole-finetune: {told}: record longer"
-    carts = learner.carts
+    assert learner.candidates == candidates
+    assert learner.snapshot()["cart_friction"] == "sigmoid"
+    carts, iteration = learner.carts, learner.loop.iteration
+    learner.candidates = [each for each in candidates if each.cart_friction == "step"]
     for episode in recorded[:2]:
         learner.add(episode)
     assert not torch.equal(learner.carts, carts)
+    assert learner.loop.env.plant.models == learner.models == learner.candidates[0]
+    assert learner.snapshot()["cart_friction"] == "step"
+    assert learner.loop.iteration == iteration
 
 
 def test_what_is_not_learned_from_is_told(

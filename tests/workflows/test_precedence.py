@@ -164,6 +164,27 @@ def test_the_order_of_words_changes_nothing(group: str) -> None:
     assert {str(value_of(each, name)) for each in found} == {str(value)}
 
 
+@pytest.mark.parametrize(
+    ("words", "at_0_02_s"),
+    [
+        ((), (0.99, 0.0, 1, 500)),
+        (("agent.horizon=0.5", "agent.action_time=0.1"), (0.96, 0.8, 1, 500)),
+        (("learning=mine.yaml", "task=swingup", "task.duration=4"), (0.99, 0.0, 10, 200)),
+        (("agent.horizon=0.5", "agent.gamma=0.9"), (0.9, 0.0, 1, 500)),
+        (("agent.horizon=null",), (0.99, 0.0, 1, 500)),
+    ],
+)
+def test_seconds_that_a_person_gives_replace_control_periods(
+    words: tuple[str, ...], at_0_02_s: tuple[float, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The experiment has gamma, action_gap and n_step."""
+    monkeypatch.chdir(tmp_path)
+    Path("mine.yaml").write_text("defaults: [fast]\nreturn_time: 0.2\n")
+    config = trained("experiment=thesis_swingup", *words)
+    agent, learning, task = (each.at(0.02) for each in (config.agent, config.learning, config.task))
+    assert (agent.gamma, agent.action_gap, learning.n_step, task.time_limit) == at_0_02_s
+
+
 @pytest.mark.parametrize(("group", "model"), [("cart_friction", "linear"), ("pole_friction", "bearing")])
 def test_an_evaluation_keeps_a_cart_that_a_person_gave(group: str, model: str) -> None:
     """In the training or in the evaluation, whatever friction model either chooses."""
