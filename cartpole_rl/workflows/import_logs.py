@@ -43,6 +43,7 @@ ANGLE_SCALE, POSITION_SCALE = 0.01, 0.10  # share by which a scale may differ
 ANGLE_ZERO = 0.02  # rad by which the upright angle may differ
 JITTER = 0.1  # share of the period
 SAME = 0.01  # share by which the periods of two logs may differ
+EARLY = 0.25  # periods by which a delay may be estimated too early; a shifted row makes it a whole one
 LATE = 0.05  # s, or two periods: a cart that takes longer is unusual
 RESAMPLED = 5e-4  # s between rows from which a log may be so fast
 LEAPS = 0.02  # share of rows
@@ -253,20 +254,22 @@ def _or_unit(factor: float) -> str:
 
 def _delay_doubts(sensors: Sensors, period: float, layout: Layout) -> Iterator[str]:
     delay = sensors.delay
-    if delay is None or (delay.high >= 0 and delay.low <= max(2 * period, LATE)):
+    if delay is None or (delay.high >= -EARLY * period and delay.low <= max(2 * period, LATE)):
         return
-    early, chosen = delay.high < 0, layout.motor.row == "chosen"
-    advice = {
-        (True, True): "try layout.motor.row=in_force",
-        (False, False): "try layout.motor.row=chosen",
-        (True, False): f"is {layout.motor.name} what was sent to the motor, in the rows' order?",
-        (False, True): "does it take the cart so long?",
-    }
+    early = delay.high < -EARLY * period
+    if early and layout.motor.row == "chosen" and delay.high + period >= -EARLY * period:
+        advice = "try layout.motor.row=in_force"
+    elif early:
+        advice = f"is {layout.motor.name} what was sent to the motor, in the rows' order?"
+    elif layout.motor.row == "in_force":
+        advice = "try layout.motor.row=chosen"
+    else:
+        advice = "does it take the cart so long?"
     when = "too early" if early else f"over {1e3 * max(2 * period, LATE):g} ms later"
     yield (
         f"the motor values seem shifted: they move the cart {when} ({1e3 * delay.value:.0f} ms, 95 %: "
         f"{1e3 * delay.low:.0f} to {1e3 * delay.high:.0f}, after the state of their row); "
-        f"{advice[early, chosen]}"
+        f"{advice}"
     )
 
 

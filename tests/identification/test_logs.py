@@ -48,11 +48,11 @@ def swings() -> Columns:
     return driven_pole(100)
 
 
-def driven_pole(most: int) -> Columns:
-    """A swinging pole on a driven cart, by equation (3.6), at a fine step; the motor acts 10 ms late."""
+def driven_pole(most: int, late: int = 10) -> Columns:
+    """A swinging pole on a driven cart, by equation (3.6), in steps of 1 ms; the motor is `late` ms late."""
     dice, fine = np.random.default_rng(3), 20
     motor = np.repeat(dice.integers(-most, most + 1, STEPS // 6), 6).astype(float)
-    step, late = PERIOD / fine, fine // 2
+    step = PERIOD / fine
     x, x_dot, theta, theta_dot, rows = 0.0, 0.0, np.pi, 0.5, []
     for index in range(STEPS * fine):
         if index % fine == 0:
@@ -407,6 +407,7 @@ BROKEN: dict[str, tuple[Callable[[Columns], Columns], list[str]]] = {
     "milliseconds": (lambda each: {**each, "t": 1e3 * each["t"]}, ["rows are 20000 ms apart.*time.unit$"]),
     "2 ms": (lambda each: {**each, "t": each["t"] / 10}, ["rows are 2 ms apart.*layout.resample=true"]),
     "a row later": (lambda each: {**each, "u": np.roll(each["u"], 1)}, ["layout.motor.row=in_force"]),
+    "two rows later": (lambda each: {**each, "u": np.roll(each["u"], 2)}, ["what was sent to the motor"]),
     "position sign": (
         lambda each: {**each, "x": -each["x"]},
         ["the other side for layout.position.positive$"],
@@ -511,10 +512,11 @@ def test_the_layout_of_the_guide_is_taken(tmp_path: Path) -> None:
     assert (taken.time.name, taken.motor.row, taken.keep) == ("t_ms", "in_force", {"error": (0, 0)})
 
 
+@pytest.mark.parametrize("late", [0, 10])
 def test_a_good_log_has_no_doubt_and_becomes_recordings(
-    tmp_path: Path, motion: Columns, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, late: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run = tmp_path / "run"
+    run, motion = tmp_path / "run", driven_pole(255, late)
     import_logs(imported(written(tmp_path / "log.csv", motion)), run)
     assert "doubt: " not in capsys.readouterr().out
     episode = read_recording(run / "recordings" / "log_00.csv")
