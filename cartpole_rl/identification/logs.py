@@ -52,7 +52,7 @@ class Report(NamedTuple):
     jumps: int  # rows to which the cart would be faster than FASTEST
     stale: float  # share of the rows of a turning pole that have the states of the row before
     period: float  # s
-    gap: float  # s, the median between rows
+    gap: float  # s, the mean between rows, as `Rows.period`
     jitter: float  # s, 95 % of the gaps are within this of the period
 
 
@@ -169,7 +169,7 @@ def cut_log(read: Rows, layout: Layout, encoders: Encoders, period: float) -> Lo
         int((np.abs(np.diff(x)) > FASTEST * gaps).sum()),
         stale_share(x, theta),
         period,
-        float(np.median(gaps)),
+        read.period,
         jitter,
     )
     return Log(parts, report)

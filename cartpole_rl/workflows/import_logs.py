@@ -30,7 +30,6 @@ from cartpole_rl.identification.logs import (
 )
 from cartpole_rl.identification.sensors import Estimate, Sensors, question_sensors
 from cartpole_rl.identification.settings import ImportConfig, Layout, log_files
-from cartpole_rl.identification.windows import UNEVEN
 from cartpole_rl.rig.hardware import nominal_hardware
 from cartpole_rl.run_folder import RECORDINGS, write_config, write_json
 from cartpole_rl.terminal import as_word, print_message, print_results, progress_bar, shown
@@ -42,7 +41,7 @@ CORRELATED = 0.2  # size of a correlation that has a sign
 ANGLE_SCALE, POSITION_SCALE = 0.01, 0.10  # share by which a scale may differ
 ANGLE_ZERO = 0.02  # rad by which the upright angle may differ
 JITTER = 0.1  # share of the period
-SAME = 0.01  # share by which the periods of two logs may differ
+SAME = 0.01  # share by which the period of a log may differ from that of others, or of the layout
 EARLY = 0.25  # periods by which a delay may be estimated too early; a shifted row makes it a whole one
 LATE = 0.05  # s, or two periods: a cart that takes longer is unusual
 RESAMPLED = 5e-4  # s between rows from which a log may be so fast
@@ -201,9 +200,9 @@ def _time_doubts(reports: Sequence[Report], period: float, layout: Layout) -> It
             f"rows are {1e3 * period:g} ms apart, and an identification takes {1e3 * SHORTEST_PERIOD:g} to "
             f"{1e3 * LONGEST_PERIOD:g} ms: mend layout.time.unit{resampled}"
         )
-    gap = float(np.median([report.gap for report in reports]))
+    gap = max((report.gap for report in reports), key=lambda each: abs(each / period - 1))
     jitter = max(report.jitter for report in reports)
-    if layout.period is not None and not layout.resample and abs(gap / period - 1) > UNEVEN:
+    if layout.period is not None and not layout.resample and abs(gap / period - 1) > SAME:
         yield (
             f"rows are {1e3 * gap:g} ms apart, not layout.period={period:g} s: leave it out, or give "
             "layout.resample=true"

@@ -300,6 +300,26 @@ def test_a_wrong_period_is_not_blamed_on_the_clock(tmp_path: Path, motion: Colum
         import_logs(config, tmp_path / "run")
 
 
+@pytest.mark.parametrize(
+    ("rate", "period", "said"),
+    [
+        (50, 0.0192, "doubt: rows are 20 ms apart, not layout.period=0.0192 s: leave it out, or give"),
+        (50, 0.0201, ""),
+        (60, 1 / 60, ""),  # the median is 17 ms
+    ],
+)
+def test_a_period_that_the_rows_contradict_is_a_doubt(
+    tmp_path: Path, motion: Columns, rate: float, period: float, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The recordings of a wrong period would have other accelerations than the log."""
+    columns = {**motion, "t": np.round(np.arange(STEPS) / rate, 3)}
+    config = imported(written(tmp_path / "log.csv", columns))
+    import_logs(config.model_copy(update={"layout": layout(period=period)}), tmp_path / "run")
+    shown = capsys.readouterr().out
+    assert said in shown
+    assert bool(said) == ("doubt: rows" in shown)
+
+
 def test_the_period_is_the_mean_gap(tmp_path: Path, motion: Columns) -> None:
     """60 Hz with stamps in whole milliseconds: the median gap is 17 ms."""
     columns = {**motion, "t": np.round(np.arange(STEPS) / 60, 3)}
