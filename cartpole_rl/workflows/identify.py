@@ -20,7 +20,7 @@ from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.recordings import read_recording, write_recording
 from cartpole_rl.files import replacing, write_text
-from cartpole_rl.identification.checks import check_recordings, check_same_encoders
+from cartpole_rl.identification.checks import check_recordings, check_same_encoders, shared_period
 from cartpole_rl.identification.experiments import EXPERIMENTS, HELD_OUT, conduct, experiment_guard
 from cartpole_rl.identification.identify import Identification, identify
 from cartpole_rl.identification.one_step import one_step_estimates
@@ -71,6 +71,7 @@ from cartpole_rl.workflows.checks import note_other_numbers
 from cartpole_rl.workflows.config import IdentifyConfig
 from cartpole_rl.workflows.poles import warn_of_another_pole
 
+CLOCK = 1e-3  # share by which a clock and the rounding of `shared_period` may change the period
 HELD_OUT_OF = 5  # one recording in so many is held out
 UNIDENTIFIABLE = {  # randomized about the identified cart, since no experiment shows them
     "track_half_length": {"distribution": "uniform", "relative": [-0.1, 0.0]},
@@ -121,6 +122,9 @@ def identify_cart(config: IdentifyConfig, folder: Path) -> None:
     )
     with progress_bar(None, "steps", desc="checking", leave=False) as bar:
         check_recordings(by_file, held_out_by_file, config.control_period, bar.update)
+    measured = shared_period(by_file | held_out_by_file)
+    if not math.isclose(measured, config.control_period, rel_tol=CLOCK):
+        config = config.model_copy(update={"control_period": measured})
     if config.source is not None:
         write_config(folder, "identify", config.model_dump(mode="json", by_alias=True))
     seconds = sum(each.steps for each in fitted.values()) * config.control_period

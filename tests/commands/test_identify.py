@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from command_line import ONCE, QUICK, TINY, Outcome, in_process
 
 from cartpole_rl.checking import validated
 from cartpole_rl.composition import without_missing
+from cartpole_rl.evaluation.recordings import read_recording, write_recording
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.workflows.config import TrainConfig
 
@@ -71,6 +73,21 @@ def test_offline_is_as_online(run: Path, results: dict[str, Any], tmp_path: Path
     done = in_process("identify", f"from={run}", *QUICK, "hydra.run.dir=again", folder=tmp_path)
     assert done.code == 0, done.err
     assert json.loads((tmp_path / "again/identification.json").read_text()) == results
+
+
+def test_the_cart_is_fitted_with_the_period_of_its_recordings(run: Path, tmp_path: Path) -> None:
+    """Of 20.3 ms, which is near enough to the setting of 20 ms not to be refused."""
+    for path in (run / "recordings").iterdir():
+        episode = read_recording(path)
+        write_recording(tmp_path / "slower" / path.name, replace(episode, time=1.015 * episode.time))
+    found = []
+    for folder, word in {"default": "label=", "given": "control_period=0.0203"}.items():
+        words = "from=slower", "method=one_step", word, f"hydra.run.dir={folder}"
+        done = in_process("identify", *words, folder=tmp_path)
+        assert done.code == 0, done.err
+        assert yaml.safe_load((tmp_path / folder / "config.yaml").read_text())["control_period"] == 0.0203
+        found.append(json.loads((tmp_path / folder / "identification.json").read_text()))
+    assert found[0] == found[1]
 
 
 @pytest.mark.parametrize("friction", ["", "cart_friction=linear"])
