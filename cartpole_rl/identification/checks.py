@@ -49,17 +49,7 @@ def check_recordings(
     Each one must show a driven cart and a moving pole; those `fitted` to must show them well together, and so
     must those `held_out`. `on_step` is called at intervals of a slow check.
     """
-    for file, episode in {**fitted, **held_out}.items():
-        with naming(file):
-            check_period(episode, period)
-            _check_units(episode)
-            if not np.ptp(episode.motor):
-                raise RecordingError(
-                    f"the motor value is {episode.motor[0]} throughout; record it with others, "
-                    "or leave it out"
-                )
-            _check_motion([episode], *LEAST_OF_EACH)
-            _check_encoders(episode, period)
+    check_each({**fitted, **held_out}, period)
     with naming(", ".join(held_out) if len(held_out) < 3 else f"the {len(held_out)} held-out recordings"):
         judges = [*held_out.values()]
         if (seconds := period * sum(episode.steps for episode in judges)) < SHORTEST_HELD_OUT:
@@ -79,6 +69,21 @@ def check_recordings(
             "the pole never hangs still and is never balanced for 5 s in the recordings, and its motion does "
             "not tell its zero; start one with half a second of the pole at rest"
         )
+
+
+def check_each(recordings: Mapping[str, Episode], period: float) -> None:
+    """Raise RecordingError for the first recording, by its file, of no driven cart with a moving pole."""
+    for file, episode in recordings.items():
+        with naming(file):
+            check_period(episode, period)
+            _check_units(episode)
+            if not np.ptp(episode.motor):
+                raise RecordingError(
+                    f"the motor value is {episode.motor[0]} throughout; record it with others, "
+                    "or leave it out"
+                )
+            _check_motion([episode], *LEAST_OF_EACH)
+            _check_encoders(episode, period)
 
 
 def shared_period(recordings: Mapping[str, Episode]) -> float:

@@ -13,9 +13,16 @@ import numpy as np
 from cartpole_rl.choices import choice, group_choices
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.recordings import LENGTH, read_heading, read_recording
-from cartpole_rl.identification.checks import check_directions, check_same_encoders, shared_period
+from cartpole_rl.identification.checks import (
+    check_directions,
+    check_each,
+    check_explained,
+    check_same_encoders,
+    shared_period,
+)
 from cartpole_rl.identification.ensemble import Ensemble
 from cartpole_rl.identification.fit import Fit, best_fit
+from cartpole_rl.identification.identify import HORIZON
 from cartpole_rl.identification.prediction import CERTAIN, REPORTED, errors_at, predict
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.windows import Windows, cut_windows, held_out_windows, split
@@ -51,8 +58,8 @@ def learn_model(config: ModelConfig, folder: Path) -> None:
 
     Writes into `folder` config.yaml, provenance.json, model.pt (for plant=learned), model.json (parameters
     and errors) and figures/model.png, and prints tables of the errors on held-out recordings. Raises
-    RecordingError for missing, damaged or too short recordings, ConfigError for several poles or a folder
-    that already holds a run.
+    RecordingError for missing, damaged, too short or implausible recordings, ConfigError for several poles or
+    a folder that already holds a run.
     """
     use_threads(config.threads)
     paths = [path for source in config.source for path in recordings(source)]
@@ -64,10 +71,15 @@ def learn_model(config: ModelConfig, folder: Path) -> None:
         raise ConfigError("pole: the recordings do not say which one it is; give the pole of this cart")
     pole_name, pole = chosen_pole("a model", config.pole, paths)
     period = shared_period(by_file)
+    check_each(by_file, period)
     check_directions(episodes, period)
     training, held_out = split(episodes)
     windows = held_out_windows(held_out, period, max(REPORTED_TIMES))
-    fit, ensemble = fit_and_learn(training, config, pole, period)
+    with waiting("fitting the physics"):
+        fit, models = fit_physics(cut_windows(training, period), config, pole, period)
+        dynamics = Dynamics.of(fit.parameters, models, period, LearnedSettings.substeps)
+        check_explained(by_file, dynamics, HORIZON)
+    ensemble = learn(training, dynamics, fit, config)
     model = learned_model(fit, ensemble, config.hardware)
     physics = predict(windows, ensemble.dynamics)
     learned = predict(windows, ensemble.dynamics, ensemble.best)
@@ -102,14 +114,9 @@ def next_command(model: LearnedModel, pole: str, folder: Path) -> str:
     return " ".join(words)
 
 
-def fit_and_learn(
-    episodes: Sequence[Episode], config: ModelConfig, pole: Pole, period: float
-) -> tuple[Fit, Ensemble]:
-    """Return the fit of the physics and the ensemble that has learned the residual."""
-    with waiting("fitting the physics"):
-        fit, models = fit_physics(cut_windows(episodes, period), config, pole, period)
-    dynamics = Dynamics.of(fit.parameters, models, period, LearnedSettings.substeps)
-    windows = cut_windows(episodes, period, most=config.windows)
+def learn(episodes: Sequence[Episode], dynamics: Dynamics, fit: Fit, config: ModelConfig) -> Ensemble:
+    """Return the ensemble that has learned the residual of the fitted physics."""
+    windows = cut_windows(episodes, dynamics.period, most=config.windows)
     ensemble = Ensemble(windows, dynamics, fit.rms, config.ensemble, config.seed, config.hardware.track_span)
     with progress_bar(config.ensemble.updates, "updates") as progress, waiting("learning"):
 
@@ -118,7 +125,7 @@ def fit_and_learn(
             progress.update(update - progress.n)
 
         ensemble.learn(show_progress)
-    return fit, ensemble
+    return ensemble
 
 
 def fit_physics(windows: Windows, config: ModelConfig, pole: Pole, period: float) -> tuple[Fit, Models]:

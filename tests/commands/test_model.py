@@ -1,10 +1,12 @@
 """A model is learned from recordings, judged by what it did not see, and is a plant to train on."""
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 import yaml
@@ -13,6 +15,7 @@ from command_line import ONCE, TINY, Outcome, in_process
 from cartpole_rl.evaluation.recordings import read_recording, write_recording
 from cartpole_rl.plants.learned import load_model
 from cartpole_rl.run_folder import experiments
+from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.model import next_command
 
 SMALL = (
@@ -64,6 +67,37 @@ def test_recordings_that_teach_a_wrong_model_are_refused(
         assert done.code == 2
         assert said in done.complaint
         assert not (tmp_path / "run").exists()
+
+
+def frozen(episode: Episode) -> Episode:
+    """With a pole that is not counted for two seconds."""
+    theta, counts = episode.theta.copy(), episode.counts.copy()
+    theta[100:200], counts[100:200, 1] = theta[100], counts[100, 1]
+    return replace(episode, theta=theta, counts=counts)
+
+
+def shuffled(episode: Episode) -> Episode:
+    """With the motor values of no cart."""
+    return replace(episode, motor=np.random.default_rng(0).permutation(episode.motor))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (frozen, "episode_001.csv: the pole's count stays at"),
+        (shuffled, "episode_001.csv: no cart explains this recording"),
+    ],
+)
+def test_recordings_of_no_cart_teach_nothing(
+    change: Callable[[Episode], Episode], said: str, recorded: Path, tmp_path: Path
+) -> None:
+    for path in experiments(recorded).values():
+        episode = read_recording(path)
+        write_recording(tmp_path / path.name, change(episode) if path.stem == "episode_001" else episode)
+    done = in_process("model", f"from={tmp_path}", *SMALL, "hydra.run.dir=run", folder=tmp_path)
+    assert done.code == 2
+    assert said in done.complaint
+    assert not (tmp_path / "run").exists()
 
 
 def report(folder: Path) -> dict[str, Any]:
