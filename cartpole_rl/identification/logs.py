@@ -91,17 +91,17 @@ def read_rows(path: Path, layout: Layout) -> Rows:
     """
     columns = read_columns(path, layout)
     known = np.logical_and.reduce([np.isfinite(values) for values in columns.values()])
+    stamps = columns[layout.time.name]
     if layout.time.since == "previous_row" and known.any():
-        gaps = columns[layout.time.name]
-        gaps = np.where(np.isfinite(gaps), gaps, 10 * np.nanmedian(gaps))  # rows are missing where unknown
-        columns[layout.time.name] = np.cumsum(gaps)
-    columns = {name: values[known] for name, values in columns.items()}
-    fresh = np.ones(known.sum(), bool)
-    fresh[1:] = ~np.logical_and.reduce([values[1:] == values[:-1] for values in columns.values()])
+        unknown = 10 * np.nanmedian(stamps)  # rows are missing there
+        stamps = np.cumsum(np.where(np.isfinite(stamps), stamps, unknown))
+    columns, stamps = {name: values[known] for name, values in columns.items()}, stamps[known]
+    fresh, compared = np.ones(known.sum(), bool), {**columns, layout.time.name: stamps}
+    fresh[1:] = ~np.logical_and.reduce([values[1:] == values[:-1] for values in compared.values()])
     columns = {name: values[fresh] for name, values in columns.items()}
     if fresh.sum() < 2:
         raise RecordingError(f"{path} has fewer than two rows with a number in each of {', '.join(columns)}")
-    time = times(path, columns[layout.time.name], layout.time)
+    time = times(path, stamps[fresh], layout.time)
     return Rows(path, columns, time, int((~known).sum()), int((~fresh).sum()))
 
 

@@ -223,6 +223,17 @@ def test_rows_without_a_number_and_repeated_ones_are_left_out(
     assert log.report.left_out == expected
 
 
+def test_the_time_since_the_row_before_can_be_kept_within_bounds(tmp_path: Path, motion: Columns) -> None:
+    """A standing cart and a constant gap are no repeated row."""
+    columns = {name: np.concatenate((values, np.full(100, values[-1]))) for name, values in motion.items()}
+    columns["t"] = np.full(STEPS + 100, PERIOD)
+    columns["t"][500] = 0.023
+    taken = layout(time={"since": "previous_row"}, keep={"t": [0.019, 0.021]})
+    log = read_log(written(tmp_path / "log.csv", columns), taken, ENCODERS)
+    assert [part.steps for part in log.parts] == [499, STEPS + 98 - 500]
+    assert log.report.left_out == {"t not in 0.019 to 0.021": 1}
+
+
 @pytest.mark.parametrize(("row", "shift"), [("chosen", 0), ("in_force", 1)])
 def test_a_part_knows_the_motor_values_before_it(
     tmp_path: Path, motion: Columns, row: str, shift: int
