@@ -7,6 +7,7 @@ finite, are left out.
 """
 
 import csv
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -30,6 +31,7 @@ TURN = {"rad": 2 * np.pi, "deg": 360.0, "turn": 1.0}
 FASTEST = 5.0  # m/s: no cart is faster
 TURNING, STALE = 0.05 / (2 * np.pi), 1 / 3  # turns in three rows; share of such rows that repeat their states
 MOST_COUNTS = 2**31 - 1  # of an encoder, as in recordings
+NUMBERS = re.compile(r"(?=.*\d)([-+.,;:|\s\dEe]|nan|inf)+", re.IGNORECASE)  # a row of them
 SLACK = 1e-6  # s, of sums of times
 LONGEST_GAP = 3  # gaps between two rows: rows further apart are missing, also where rows are resampled
 UNKNOWN, TWICE = "with an empty cell or no finite number", "that repeat the row before"
@@ -197,29 +199,43 @@ def read_columns(path: Path, layout: Layout) -> dict[str, Array]:
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "it is not UTF-8 text"
         raise RecordingError(f"{path} cannot be read: {reason}") from None
-    numbered = [
-        (number, line)
-        for number, line in enumerate(text.splitlines(), 1)
-        if line.strip() and not line.lstrip().startswith(layout.comment)
-    ]
-    if len(numbered) < 3:
+    (number, names), numbered = heading_and_rows(text, layout)
+    if not numbered:
         raise NotALogError(f"{path} holds no rows; give a log with a line of column names")
-    delimiter = layout.delimiter or found_delimiter(numbered[0][1], layout.decimal)
-    rows = [cells(path, number, line, delimiter) for number, line in numbered]
-    heading = rows[0]
+    delimiter = layout.delimiter or found_delimiter(names, layout.decimal)
+    heading = cells(path, number, names, delimiter)
     check_columns(path, wanted, heading)
-    lines = [number for number, _ in numbered[1:]]
-    longer = [place for place, row in enumerate(rows[1:]) if any(row[len(heading) :])]
+    lines, rows = [number for number, _ in numbered], [cells(path, *each, delimiter) for each in numbered]
+    longer = [place for place, row in enumerate(rows) if any(row[len(heading) :])]
     if 2 * len(longer) > len(lines):  # a few may end with a comment
         raise RecordingError(
-            f"{path}, line {lines[longer[0]]}: it has {len(rows[longer[0] + 1])} cells under {len(heading)} "
+            f"{path}, line {lines[longer[0]]}: it has {len(rows[longer[0]])} cells under {len(heading)} "
             "names; mend decimal= and delimiter= of the layout"
         )
-    return {name: _numbers(path, name, heading.index(name), rows[1:], lines, layout) for name in wanted}
+    return {name: _numbers(path, name, heading.index(name), rows, lines, layout) for name in wanted}
+
+
+def heading_and_rows(text: str, layout: Layout) -> tuple[tuple[int, str], list[tuple[int, str]]]:
+    """Return the line of column names, and the rows, with their line numbers.
+
+    NumPy writes the names as the last comment before the numbers.
+    """
+    numbered = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
+    marked = [line.lstrip().startswith(layout.comment) for _, line in numbered]
+    first = marked.index(False) if False in marked else len(marked)
+    rows = [each for each, comment in zip(numbered, marked, strict=True) if not comment]
+    if 0 < first < len(marked) and NUMBERS.fullmatch(rows[0][1]):
+        number, names = numbered[first - 1]
+        names = names.lstrip().removeprefix(layout.comment)
+    else:
+        number, names = rows.pop(0) if rows else (0, "")
+    return (number, re.sub(r"^ *[#%] *", "", names)), rows
 
 
 def check_columns(path: Path, wanted: Sequence[str], present: Sequence[str]) -> None:
-    """Raise RecordingError for a wanted column that is not present."""
+    """Raise RecordingError for a wanted column that is not present, or present twice."""
+    if twice := [name for name in dict.fromkeys(wanted) if list(present).count(name) > 1]:
+        raise RecordingError(f"{path} has several columns {', '.join(twice)}; give each a name of its own")
     if missing := [name for name in wanted if name not in present]:
         kind = NotALogError if len(missing) == len(wanted) else RecordingError
         raise kind(f"{path} has no column {', '.join(missing)}; it has {', '.join(present)}")
@@ -285,7 +301,7 @@ def cells(path: Path, number: int, line: str, delimiter: str) -> list[str]:
     if delimiter == " " and '"' not in line:  # as in a table that is aligned by blanks
         return line.split()
     try:
-        (row,) = csv.reader([line.strip()], delimiter=delimiter, skipinitialspace=True)
+        (row,) = csv.reader([line.strip(" ")], delimiter=delimiter, skipinitialspace=True)
     except (csv.Error, ValueError):
         raise RecordingError(f"{path}, line {number}: it is no row of cells; leave the line out") from None
     return [cell.strip() for cell in row]

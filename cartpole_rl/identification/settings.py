@@ -81,6 +81,18 @@ class Layout(Settings):
     shortest: Positive = 1.5  # s of a part that is kept
 
     @model_validator(mode="after")
+    def _columns_differ(self) -> "Layout":
+        taken: dict[str, str] = {}
+        for field in ("time", "position", "angle", "motor"):
+            name = getattr(self, field).name
+            if name in taken:
+                raise ValueError(
+                    f"{field}.name={name}: {taken[name]}.name is the same; give each its own column"
+                )
+            taken[name] = field
+        return self
+
+    @model_validator(mode="after")
     def _bounds_are_in_order(self) -> "Layout":
         for name, (low, high) in self.keep.items():
             if low > high:

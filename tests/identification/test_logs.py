@@ -105,6 +105,9 @@ def imported(source: Path) -> ImportConfig:
         ({"delimiter": " "}, {}),
         ({"head": "% written by MATLAB\n\n"}, {"comment": "%"}),
         ({"delimiter": " ", "row": "{:16.9g}"}, {}),
+        ({"delimiter": " ", "head": "# of Monday\n# "}, {}),  # numpy.savetxt(header=...)
+        ({"delimiter": "\t", "head": "# "}, {"comment": "%"}),
+        ({"head": "//"}, {"comment": "//"}),
     ],
 )
 def test_a_log_is_read_in_every_style(
@@ -116,6 +119,18 @@ def test_a_log_is_read_in_every_style(
     assert part.x == pytest.approx(motion["x"], abs=2e-5)
     assert part.theta == pytest.approx(motion["a"], abs=1e-3)
     assert part.motor.tolist() == motion["u"][:-1].tolist()
+
+
+def test_an_empty_first_cell_shifts_no_row(tmp_path: Path, motion: Columns) -> None:
+    """As where pandas writes an index without a name, or the clock of a row is missing."""
+    text = written(tmp_path / "log.csv", {"": np.arange(STEPS), **motion}, "\t").read_text()
+    (part,) = read_log(tmp_path / "log.csv", layout(), ENCODERS).parts
+    assert part.x == pytest.approx(motion["x"], abs=2e-5)
+    lines = [line.partition("\t")[2] for line in text.splitlines()]
+    lines[500] = lines[500][lines[500].index("\t") :]
+    (tmp_path / "log.csv").write_text("\n".join(lines))
+    log = read_log(tmp_path / "log.csv", layout(), ENCODERS)
+    assert log.report.left_out == {"with an empty cell or no finite number": 1}
 
 
 def parquet(path: Path, columns: Columns) -> None:
@@ -343,6 +358,9 @@ def test_the_period_is_the_mean_gap(tmp_path: Path, motion: Columns) -> None:
     ("text", "message"),
     [
         ("", "holds no rows"),
+        ("t,x,a,u\n", "holds no rows; give a log with a line of column names"),
+        ("t,x,a,u\n0,0,0,0\n", "fewer than two rows with a number in each of t, x, a, u"),
+        ("t,x,x,a,u\n0,0,0,0,0\n1,1,1,1,1\n", "has several columns x; give each a name of its own"),
         ("t,x,a\n0,0,0\n1,1,1\n", r"has no column u; it has t, x, a"),
         ("t,x,a,u\n0,0,0,0\n1,0,,0\n2,0,nan,0\n", "fewer than two rows with a number in each of t, x, a, u"),
         ("t,x,a,u\n0,0,0,0\n1,0,two,0\n", "line 3: a is 'two'"),
@@ -367,6 +385,7 @@ def test_a_bad_log_is_one_line(tmp_path: Path, text: str, message: str) -> None:
         ({"keep": {"bad": [1, 0]}}, r"give the lower bound first, as \[0,1\]"),
         ({"angle": {"unit": "grad"}}, "angle.unit"),
         ({"motor": {"full": 0}}, "motor.full=0"),
+        ({"angle": {"name": "x"}}, "angle.name=x: position.name is the same; give each its own column"),
     ],
 )
 def test_a_bad_layout_is_one_line(changes: dict[str, Any], message: str) -> None:
