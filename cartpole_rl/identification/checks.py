@@ -149,6 +149,8 @@ def motions(episodes: Sequence[Episode]) -> list[Motion]:
 def shows_motion(episode: Episode) -> bool:
     """Return True if the motor value changes, and cart and pole move enough to be fitted to."""
     travel, swing = LEAST_OF_EACH
+    if not episode.steps:
+        return False
     return bool(np.ptp(episode.motor) and np.ptp(episode.x) >= travel and np.ptp(episode.theta) >= swing)
 
 

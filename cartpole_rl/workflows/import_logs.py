@@ -43,6 +43,7 @@ ANGLE_ZERO = 0.02  # rad by which the upright angle may differ
 JITTER = 0.1  # share of the period
 SAME = 0.01  # share by which the period of a log may differ from that of others, or of the layout
 EARLY = 0.25  # periods by which a delay may be estimated too early; a shifted row makes it a whole one
+FINER = 0.8  # share of the time between rows: a shorter period of a resampled log is invented
 LATE = 0.05  # s, or two periods: a cart that takes longer is unusual
 RESAMPLED = 5e-4  # s between rows from which a log may be so fast
 LEAPS = 0.02  # share of rows
@@ -193,7 +194,10 @@ def doubts(reports: Sequence[Report], sensors: Sensors, period: float, layout: L
 
 
 def _time_doubts(reports: Sequence[Report], period: float, layout: Layout) -> Iterator[str]:
-    if not SHORTEST_PERIOD <= period <= LONGEST_PERIOD:
+    taken = SHORTEST_PERIOD <= period <= LONGEST_PERIOD
+    if layout.period is not None and not taken:
+        yield f"layout.period={period:g} s: give {SHORTEST_PERIOD:g} to {LONGEST_PERIOD:g}, or leave it out"
+    elif not taken:
         fast = RESAMPLED <= period < SHORTEST_PERIOD
         resampled = ", or give layout.period=0.01 layout.resample=true" if fast else ""
         yield (
@@ -201,13 +205,19 @@ def _time_doubts(reports: Sequence[Report], period: float, layout: Layout) -> It
             f"{1e3 * LONGEST_PERIOD:g} ms: mend layout.time.unit{resampled}"
         )
     gap = max((report.gap for report in reports), key=lambda each: abs(each / period - 1))
+    if layout.resample and period < FINER * gap:
+        yield (
+            f"layout.period={period:g} s is shorter than the {1e3 * gap:g} ms between rows, and nothing was "
+            "measured in between: give a longer one, or leave it out"
+        )
     jitter = max(report.jitter for report in reports)
-    if layout.period is not None and not layout.resample and abs(gap / period - 1) > SAME:
+    contradicted = layout.period is not None and not layout.resample and abs(gap / period - 1) > SAME
+    if contradicted and taken:
         yield (
             f"rows are {1e3 * gap:g} ms apart, not layout.period={period:g} s: leave it out, or give "
             "layout.resample=true"
         )
-    elif jitter > JITTER * period and not layout.resample:
+    elif jitter > JITTER * period and not layout.resample and not contradicted:
         yield (
             f"the time between rows varies: 5 % are over {1e3 * jitter:.1f} ms from the period of "
             f"{1e3 * period:g} ms; give the clock of the cart's board as layout.time, or layout.resample=true"

@@ -346,6 +346,26 @@ def test_a_period_that_the_rows_contradict_is_a_doubt(
     assert bool(said) == ("doubt: rows" in shown)
 
 
+@pytest.mark.parametrize("period", [40, 20])
+def test_a_period_beyond_all_is_blamed(tmp_path: Path, motion: Columns, period: float) -> None:
+    """Longer than the log, and shorter."""
+    config = imported(written(tmp_path / "log.csv", motion))
+    config = config.model_copy(update={"layout": layout(period=period, resample=True)})
+    said = f"stand still; layout.period={period} s: give 0.005 to 0.1, or leave it out"
+    with pytest.raises(RecordingError, match=re.escape(said)):
+        import_logs(config, tmp_path / "run")
+
+
+@pytest.mark.parametrize(("period", "doubted"), [(0.005, True), (0.018, False)])
+def test_rows_are_not_invented_without_a_doubt(
+    tmp_path: Path, motion: Columns, period: float, doubted: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = imported(written(tmp_path / "log.csv", motion))
+    import_logs(config.model_copy(update={"layout": layout(period=period, resample=True)}), tmp_path / "run")
+    said = f"doubt: layout.period={period} s is shorter than the 20 ms between rows"
+    assert doubted == (said in capsys.readouterr().out)
+
+
 def test_the_period_is_the_mean_gap(tmp_path: Path, motion: Columns) -> None:
     """60 Hz with stamps in whole milliseconds: the median gap is 17 ms."""
     columns = {**motion, "t": np.round(np.arange(STEPS) / 60, 3)}
