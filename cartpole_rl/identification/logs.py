@@ -39,7 +39,7 @@ SHORT, STANDING = "in a part that is too short", "in a part in which motor, cart
 
 
 class NotALogError(RecordingError):
-    """A file without rows, or with none of the columns that the layout names."""
+    """A file that is no text, has fewer than two rows, or none of the columns that the layout names."""
 
 
 class Report(NamedTuple):
@@ -102,7 +102,7 @@ def read_rows(path: Path, layout: Layout) -> Rows:
     fresh[1:] = ~np.logical_and.reduce([values[1:] == values[:-1] for values in compared.values()])
     columns = {name: values[fresh] for name, values in columns.items()}
     if fresh.sum() < 2:
-        raise RecordingError(f"{path} has fewer than two rows with a number in each of {', '.join(columns)}")
+        raise NotALogError(f"{path} has fewer than two rows with a number in each of {', '.join(columns)}")
     time = times(path, stamps[fresh], layout.time)
     return Rows(path, columns, time, int((~known).sum()), int((~fresh).sum()))
 
@@ -197,8 +197,9 @@ def read_columns(path: Path, layout: Layout) -> dict[str, Array]:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "it is not UTF-8 text"
-        raise RecordingError(f"{path} cannot be read: {reason}") from None
+        if isinstance(error, OSError):
+            raise RecordingError(f"{path} cannot be read: {error.strerror}") from None
+        raise NotALogError(f"{path} cannot be read: it is not UTF-8 text") from None
     (number, names), numbered = heading_and_rows(text, layout)
     if not numbered:
         raise NotALogError(f"{path} holds no rows; give a log with a line of column names")
@@ -285,14 +286,14 @@ def array_columns(
     check_columns(path, wanted, [*present])
     columns = {}
     for name in wanted:
-        column = np.squeeze(present[name])
+        column = np.atleast_1d(np.squeeze(present[name]))
         if column.ndim != 1 or column.dtype.kind not in "fiub":
             raise RecordingError(f"{path}: {name} is no column of numbers")
         columns[name] = column.astype(float)
     sizes = {name: len(column) for name, column in columns.items()}
-    if len(set(sizes.values())) > 1 or min(sizes.values()) < 2:
+    if len(set(sizes.values())) > 1:
         listed = ", ".join(f"{name} {size}" for name, size in sizes.items())
-        raise RecordingError(f"{path}: columns need the same number of rows, 2 at least; rows: {listed}")
+        raise RecordingError(f"{path}: columns need the same number of rows; rows: {listed}")
     return columns
 
 

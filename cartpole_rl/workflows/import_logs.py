@@ -77,7 +77,8 @@ def import_logs(config: ImportConfig, folder: Path) -> Sensors | None:
         raise others[0]
     for other in others:
         print_message("import", f"note: left out: {other}")
-    period = config.layout.period or common_period(rows, config.source)
+    long = {path: read for path, read in rows.items() if read.time[-1] >= config.layout.shortest} or rows
+    period = config.layout.period or common_period(long, config.source)
     logs = {
         path: cut_log(read, config.layout, config.hardware.encoders, period) for path, read in rows.items()
     }
@@ -105,12 +106,14 @@ def import_logs(config: ImportConfig, folder: Path) -> Sensors | None:
 
 def common_period(rows: Mapping[Path, Rows], source: Path) -> float:
     """Return the control period of all logs, s. Raises RecordingError if they have several."""
-    periods = sorted(read.period for read in rows.values())
-    middle = periods[len(periods) // 2]
-    if periods[-1] - middle > SAME * middle or middle - periods[0] > SAME * middle:
+    periods = {path.name: read.period for path, read in rows.items()}
+    usual = sorted(periods, key=lambda name: periods[name])[len(periods) // 2]
+    middle = periods[usual]
+    other = max(periods, key=lambda name: abs(periods[name] - middle))
+    if abs(periods[other] - middle) > SAME * middle:
         raise RecordingError(
-            f"from={source}: the logs have control periods from {1e3 * periods[0]:g} to "
-            f"{1e3 * periods[-1]:g} ms; import those of one period at a time, or give layout.period and "
+            f"from={source}: {other} has a row every {1e3 * periods[other]:g} ms, {usual} every "
+            f"{1e3 * middle:g} ms; import those of one period at a time, or give layout.period and "
             "layout.resample=true"
         )
     return middle
@@ -194,6 +197,7 @@ def doubts(reports: Sequence[Report], sensors: Sensors, period: float, layout: L
 
 
 def _time_doubts(reports: Sequence[Report], period: float, layout: Layout) -> Iterator[str]:
+    reports = [each for each in reports if each.rows * each.gap >= layout.shortest] or reports
     taken = SHORTEST_PERIOD <= period <= LONGEST_PERIOD
     if layout.period is not None and not taken:
         yield f"layout.period={period:g} s: give {SHORTEST_PERIOD:g} to {LONGEST_PERIOD:g}, or leave it out"
@@ -204,13 +208,14 @@ def _time_doubts(reports: Sequence[Report], period: float, layout: Layout) -> It
             f"rows are {1e3 * period:g} ms apart, and an identification takes {1e3 * SHORTEST_PERIOD:g} to "
             f"{1e3 * LONGEST_PERIOD:g} ms: mend layout.time.unit{resampled}"
         )
-    gap = max((report.gap for report in reports), key=lambda each: abs(each / period - 1))
-    if layout.resample and period < FINER * gap:
+    gaps = [report.gap for report in reports]
+    if layout.resample and period < FINER * max(gaps):
         yield (
-            f"layout.period={period:g} s is shorter than the {1e3 * gap:g} ms between rows, and nothing was "
-            "measured in between: give a longer one, or leave it out"
+            f"layout.period={period:g} s is shorter than the {1e3 * max(gaps):g} ms between rows, and "
+            "nothing was measured in between: give a longer one, or leave it out"
         )
     jitter = max(report.jitter for report in reports)
+    gap = max(gaps, key=lambda each: abs(each / period - 1))
     contradicted = layout.period is not None and not layout.resample and abs(gap / period - 1) > SAME
     if contradicted and taken:
         yield (

@@ -518,7 +518,7 @@ def test_logs_of_several_periods_are_refused(tmp_path: Path, motion: Columns) ->
     folder.mkdir()
     written(folder / "a.csv", motion)
     written(folder / "b.csv", {**motion, "t": motion["t"] / 2})
-    with pytest.raises(RecordingError, match="control periods from 10 to 20 ms"):
+    with pytest.raises(RecordingError, match=r"b\.csv has a row every 10 ms, a\.csv every 20 ms"):
         import_logs(imported(folder), tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
@@ -544,12 +544,28 @@ def test_a_file_beside_the_logs_is_left_out(
     folder.mkdir()
     notes = folder / "notes.txt"
     notes.write_text("on Monday\nthe cart was cold\nand the pole bent\n")
-    for source in (folder, notes):
-        with pytest.raises(RecordingError, match=r"notes\.txt has no column t, x, a, u; it has on, Monday"):
-            import_logs(imported(source), tmp_path / "run")
+    (folder / "measures.txt").write_bytes("Maße".encode("latin-1"))
+    np.savez(folder / "aborted.npz", **{name: values[:1] for name, values in motion.items()})
+    written(folder / "aborted.csv", {name: values[:1] for name, values in motion.items()})
+    reasons = {
+        "notes.txt": " has no column t, x, a, u; it has on, Monday",
+        "measures.txt": " cannot be read: it is not UTF-8 text",
+        "aborted.npz": " has fewer than two rows with a number in each of t, x, a, u",
+        "aborted.csv": " has fewer than two rows with a number in each of t, x, a, u",
+    }
+    for name, reason in reasons.items():
+        with pytest.raises(RecordingError, match=re.escape(f"{name}{reason}")):
+            import_logs(imported(folder / name), tmp_path / "run")
+    with pytest.raises(RecordingError, match=re.escape(f"aborted.csv{reasons['aborted.csv']}")):
+        import_logs(imported(folder), tmp_path / "run")
+    short = {name: values[:2] for name, values in motion.items()}
+    written(folder / "short.csv", {**short, "t": np.array([0, 0.5])})  # of no period
     written(folder / "a.csv", motion)
     import_logs(imported(folder), tmp_path / "run")
-    assert f"note: left out: {notes} has no column t, x, a, u" in capsys.readouterr().err
+    said = capsys.readouterr()
+    for name, reason in reasons.items():
+        assert f"note: left out: {folder / name}{reason}" in said.err
+    assert "doubt: " not in said.out
     assert {path.name[:2] for path in (tmp_path / "run/recordings").iterdir()} == {"a_"}
     written(folder / "b.csv", {"t": motion["t"], "x": motion["x"]})
     with pytest.raises(RecordingError, match=r"b\.csv has no column a, u; it has t, x"):
