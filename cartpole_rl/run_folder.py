@@ -235,11 +235,11 @@ def recordings(source: Path) -> list[Path]:
 def experiments(source: Path) -> dict[str, Path]:
     """Return `recordings` by the names of their experiments, or of their files. Raises the same errors.
 
-    "01_swing" is the experiment swing, unless there is a second one.
+    "01_swing" is the experiment swing, unless there is a second one, or a file of that name.
     """
     names = {path: re.sub(r"^\d\d_(?=.)", "", path.stem) for path in recordings(source)}
-    number = Counter(names.values())
-    return {name if number[name] == 1 else path.stem: path for path, name in names.items()}
+    taken = Counter([*names.values(), *(path.stem for path, name in names.items() if path.stem != name)])
+    return {name if taken[name] == 1 else path.stem: path for path, name in names.items()}
 
 
 def write_inputs(folder: Path, needs: Iterable[Path]) -> None:

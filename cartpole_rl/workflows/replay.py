@@ -9,10 +9,19 @@ from typing import Any
 
 import numpy as np
 
+from cartpole_rl.errors import RecordingError
 from cartpole_rl.evaluation.recordings import read_recording
 from cartpole_rl.identification.checks import check_same_encoders, shared_period
-from cartpole_rl.identification.prediction import Replayed, all_errors, away_from_upright, errors_at, replay
+from cartpole_rl.identification.prediction import (
+    LEAD,
+    Replayed,
+    all_errors,
+    away_from_upright,
+    errors_at,
+    replay,
+)
 from cartpole_rl.identification.rollout import Dynamics
+from cartpole_rl.identification.windows import lead_periods
 from cartpole_rl.randomization.poles import Pole
 from cartpole_rl.reporting.episodes import columns
 from cartpole_rl.reporting.predictions import REPORTED_TIMES, replay_figure, replay_table
@@ -57,6 +66,11 @@ def replay_recordings(config: ReplayConfig, folder: Path) -> None:
     dynamics = Dynamics.of(parameters, models, period, plant.substeps)
     replays = replay(by_file, dynamics, config.restart)
     errors = errors_at(all_errors(replays), REPORTED_TIMES, period)
+    if not errors:
+        seconds = lead_periods(LEAD, period) * period + REPORTED_TIMES[0]
+        raise RecordingError(
+            f"from={config.source}: no recording lasts {seconds:g} s without a lost frame: record longer"
+        )
     kept = np.concatenate([away_from_upright(each) for each in replays])
     away = errors_at(all_errors(replays)[:, :, kept], REPORTED_TIMES, period)
     write_config(folder, "replay", {**config.model_dump(mode="json", by_alias=True), "seed": None})

@@ -26,6 +26,11 @@ def test_experiments_have_the_names_of_their_files_without_the_number(tmp_path: 
     assert experiments(tmp_path) == {"long_swing": swing, "plain": plain}
 
 
+def test_no_recording_takes_the_name_of_another(tmp_path: Path) -> None:
+    paths = write(tmp_path, "01_a.csv", "02_a.csv", "05_01_a.csv", "07_b.csv", "b.csv")
+    assert experiments(tmp_path) == {path.stem: path for path in paths}
+
+
 @pytest.mark.parametrize(
     ("name", "missing"), [(".", "it contains no recording"), ("none", "there is no such file or folder")]
 )
