@@ -149,11 +149,13 @@ def cut_log(read: Rows, layout: Layout, encoders: Encoders, period: float) -> Lo
         late = int(layout.motor.row == "in_force")
         values = motor[rows[:-1] + late]
         steady = np.flatnonzero(~regular[:first])
-        earliest = max(first - history_periods(period), int(steady[-1]) + 1 if len(steady) else 0)
-        before = motor[earliest + late : first + late]
+        start, history = int(steady[-1]) + 1 if len(steady) else 0, history_periods(period)
+        before = motor[max(first - history, start) + late : first + late]
         if layout.resample:
             states, values = resampled(time[rows], states, values, period)
-            before = before[:0]
+            history = min(history, int((time[first] - time[start]) / period + SLACK))
+            grid = time[first] - period * np.arange(history, -1, -1)
+            before = averaged(time[start : first + 1], motor[start + late : first + late], grid)
         part = _episode(states, values, period, encoders, before)
         if shows_motion(part):
             parts.append(part)
@@ -350,8 +352,13 @@ def resampled(time: Array, states: Array, motor: Array, period: float) -> tuple[
     """
     grid = np.arange(time[0], time[-1] + 1e-9, period)
     at = np.stack([np.interp(grid, time, column) for column in states.T], 1)
+    return at, averaged(time, motor, grid)
+
+
+def averaged(time: Array, motor: Array, grid: Array) -> Array:
+    """Return the means of motor values [T], between `time` [T + 1], in each period of `grid` [K + 1]."""
     total = np.concatenate((np.zeros(1), np.cumsum(motor * np.diff(time))))
-    return at, np.diff(np.interp(grid, time, total)) / period
+    return np.diff(np.interp(grid, time, total)) / np.diff(grid)
 
 
 def _episode(states: Array, motor: Array, period: float, encoders: Encoders, before: Array) -> Episode:

@@ -260,6 +260,9 @@ def test_a_part_knows_the_motor_values_before_it(
     keep = layout(keep={"ok": [1, 1]}, motor={"row": row})
     first, *others = read_log(path, keep, nominal_encoders()).parts
     assert first.motor_before == ()
+    resampled = keep.model_copy(update={"resample": True})
+    again = read_log(path, resampled, ENCODERS).parts
+    assert [part.motor_before for part in again] == [(), *(part.motor_before for part in others)]
     values = motion["u"].astype(int).tolist()
     before = {part.motor_before for part in others}
     assert tuple(values[489 + shift : 501 + shift]) in before  # 0.24 s
