@@ -6,6 +6,7 @@ An exception unwinds every `with`: the motor is at 0 and the cart disarmed befor
 import atexit
 import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -14,6 +15,8 @@ from types import FrameType
 # s after a signal during which others are ignored: they would interrupt the unwinding. Stopping a cart that
 # does not answer takes up to 5.5 s: LONGEST_STOP, LAST_STOP and LONGEST_WRITE in `plants.serial`.
 UNWINDING = 6.0
+AGAIN = 0.1  # s
+NUMBER = "signal_number"  # the attribute of an error that a signal raised
 PARENT_POLL = 0.5  # s
 PARENT = "CARTPOLE_RL_PARENT"  # in the environment of a process that serves a cart: the one that started it
 
@@ -33,26 +36,40 @@ class RaiseOnce:
     """A signal handler that raises `error(number)`, and ignores further signals for UNWINDING s.
 
     A second signal could otherwise leave a `with` before the motor is stopped. Later signals raise again, so
-    a program that hangs can still be ended. While the interpreter ends, they are ignored: the exit code is
-    that of the first signal.
+    a program that hangs can still be ended. Where Python swallows the error, as in a destructor, the signal
+    comes once more. While the interpreter ends, they are ignored: the exit code is that of the first signal.
     """
 
     def __init__(self, error: Callable[[int], BaseException]) -> None:
         self._error = error
         self._raised_at = -UNWINDING
+        self._unraisable: Callable[[sys.UnraisableHookArgs], object] = sys.unraisablehook
 
     def handle(self, *numbers: int) -> None:
         """Handle these signals from now on."""
         for number in numbers:
             signal.signal(number, self)
         atexit.register(self._ignore, *numbers)
+        earlier = getattr(sys.unraisablehook, "__self__", None)
+        self._unraisable = earlier._unraisable if isinstance(earlier, RaiseOnce) else sys.unraisablehook
+        sys.unraisablehook = self._swallowed
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
         """Raise, unless the last error may still be unwinding."""
         now = time.monotonic()
         if now - self._raised_at >= UNWINDING:
-            self._raised_at = now
-            raise self._error(number)
+            self._raised_at, error = now, self._error(number)
+            vars(error)[NUMBER] = number
+            raise error
+
+    def _swallowed(self, unraisable: "sys.UnraisableHookArgs") -> None:
+        """Let the signal come again if Python swallowed its error; later, or it would swallow that too."""
+        if (number := getattr(unraisable.exc_value, NUMBER, None)) is not None:
+            self._raised_at = -UNWINDING
+            again = threading.Timer(AGAIN, signal.raise_signal, [number])
+            again.daemon = True
+            again.start()
+        self._unraisable(unraisable)
 
     def _ignore(self, *numbers: int) -> None:
         """Ignore the signals that are still handled here: Python would set them to their defaults."""

@@ -153,9 +153,13 @@ def strength(hardware: Hardware) -> float:
     return 1 / (hardware.motor_per_newton * hardware.moving_mass)
 
 
-def track_end(hardware: Hardware) -> float:
-    """Return how far from the middle an experiment may get, m."""
-    soft = hardware.half_span - hardware.soft_limit
+def track_end(hardware: Hardware, soft_limit: float = math.inf) -> float:
+    """Return how far from the middle an experiment may get, m.
+
+    `soft_limit` is that of a cart, m from the middle, where it is known: its track may be shorter than its
+    file's.
+    """
+    soft = min(hardware.half_span - hardware.soft_limit, soft_limit)
     return soft - min(CLEARANCE, LARGEST_CLEARANCE * soft)
 
 
@@ -327,8 +331,8 @@ def run(
     """
     counts, gaps, motors, ended = [present.counts], [*present.dt], [], str(Ending.TIME)
     requested, breakaway = next(moves), None
-    guard, end = experiment_guard(task.period, task.hardware), track_end(task.hardware)
-    encoders = plant.hardware.encoders
+    guard, encoders = experiment_guard(task.period, task.hardware), plant.hardware.encoders
+    end = track_end(task.hardware, float(plant.track_half_length))
     while True:
         now = observed(counts, gaps, encoders)
         motor = guarded(requested, now.x, now.x_dot, guard, end)
@@ -343,7 +347,7 @@ def run(
             requested = moves.send(observed(counts, gaps, encoders))
         except StopIteration as result:
             breakaway = result.value
-            present = plant.step_one(0) if motors[-1] else present
+            present = plant.step_one(0) if motor or motors[-1] else present
             break
     recorded = recording(np.array(counts), np.array(gaps[1:]), np.array(motors), ended, encoders)
     return measured_part(recorded, plant.fault, plant.hardware), present, breakaway

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cartpole_rl.errors import RecordingError
-from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.tasks.episode import IRREGULAR, Episode
 
 WINDOW = 0.5  # s, of the windows that a cart is fitted to
 HISTORY, LEAST_HISTORY = 0.24, 6  # s and periods of motor values before a window: what a residual reads
@@ -21,7 +21,6 @@ JUDGING = 4  # one window in so many judges models that are fitted to the others
 LEAST_LEAD = 5  # periods whose positions give an initial state
 HELD_OUT = 5  # one recording in so many is held out
 HELD_OUT_LEAD = 0.2  # s of a held-out window that give its initial state
-IRREGULAR = 0.2  # share of the period that a frame may come early or late
 UNEVEN = IRREGULAR + 0.01  # the same where stamps are rounded to whole milliseconds
 
 
@@ -184,7 +183,7 @@ def regular_frames(episode: Episode, period: float) -> NDArray[np.bool_]:
         raise RecordingError(
             f"a recording has a frame every {np.median(gaps) * 1e3:.1f} ms, not every {period * 1e3:.1f} ms"
         )
-    return np.abs(gaps / period - 1) < IRREGULAR
+    return episode.regular_frames(period)
 
 
 def mean_gap(time: NDArray[np.float64]) -> float:

@@ -7,6 +7,7 @@ continues on both, with the same loop and the same loss.
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from tensordict import TensorDictBase
 
@@ -30,17 +31,18 @@ def recorded_chunks(
 
     `pole_length` m is that of the cart, None if it is not known; `hardware` is the cart's, ip02's if it is
     not given. The last step before a lost link is left out, since its outcome was not measured. So are the
-    steps that no action of the agent drove, such as those of the firmware's brake or of a late value: they
-    part the episode into chunks [1, T].
+    steps that no action of the agent drove, such as those of the firmware's brake or of a late value, and
+    those at whose end a frame came late or was lost: they part the episode into chunks [1, T].
     """
     env = make_env(RecordedPlant(episode, pole_length, hardware))
     index = {motor: action for action, motor in enumerate(motors)}
     current = env.reset()
     parts: list[list[TensorDictBase]] = [[]]
-    for motor in episode.motor[: episode.measured_steps].tolist():
+    regular = episode.regular_frames(float(np.median(np.diff(episode.time))) if episode.steps else 1.0)
+    for motor, in_time in zip(episode.motor[: episode.measured_steps].tolist(), regular, strict=False):
         current["action"] = torch.tensor([index.get(motor, 0)])
         transition, current = env.step_and_maybe_reset(current)
-        if motor in index:
+        if in_time and motor in index:
             parts[-1].append(transition.select(*COLLECTED))
         else:
             parts.append([])

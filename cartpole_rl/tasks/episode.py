@@ -18,6 +18,7 @@ from cartpole_rl.tasks.rewards import UPRIGHT_ANGLE
 from cartpole_rl.tasks.settings import Measure
 
 Array = NDArray[np.float64]
+IRREGULAR = 0.2  # share of the period that a frame may come early or late
 HOLD = 1.0  # s that the pole has to stay upright
 
 
@@ -79,6 +80,10 @@ class Episode:
     def measured_steps(self) -> int:
         """Number of control periods whose outcome was measured: all but the last one before a lost link."""
         return self.steps - (self.ended_by == "link")
+
+    def regular_frames(self, period: float) -> NDArray[np.bool_]:
+        """Return for each control period of `period` s, [T], whether the frame at its end came in time."""
+        return np.abs(np.diff(self.time) / period - 1) < IRREGULAR
 
     def part(self, first: int, last: int) -> "Episode":
         """Return the control periods from `first` up to, and without, `last`."""

@@ -329,7 +329,11 @@ def evaluated_env(
     emulator = config.emulator.model_copy(update={"seed": config.emulator.seed + config.seed})
     numbers = {**settings.cart, **settings.pole.heaviest.model_dump()}
     plant = config.plant.build(emulator, settings.control_period, angle, prompt, confirm, numbers)
-    return environment(settings, plant)
+    try:
+        return environment(settings, plant)
+    except BaseException:
+        plant.close()
+        raise
 
 
 def precedence(plant: PlantSettings, emulator: EmulatorSettings) -> AbstractContextManager[None]:

@@ -78,6 +78,22 @@ def test_a_second_signal_does_not_interrupt_the_unwinding(monkeypatch: pytest.Mo
         os.kill(os.getpid(), signal.SIGTERM)
 
 
+def test_a_signal_that_python_swallowed_comes_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    swallowed = []
+    monkeypatch.setattr(sys, "unraisablehook", swallowed.append)
+    RaiseOnce(lambda number: InterruptedError(number)).handle(signal.SIGTERM)
+
+    class Destroyed:
+        def __del__(self) -> None:
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(0.01)
+
+    Destroyed()
+    with pytest.raises(InterruptedError):
+        time.sleep(60)
+    assert len(swallowed) == 1
+
+
 def test_a_hangup_that_nohup_ignores_stays_ignored() -> None:
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     assert ending_signals() == [signal.SIGTERM]

@@ -30,6 +30,7 @@ from cartpole_rl.identification.experiments import (
     guarded,
     hold,
     reach,
+    run,
     track_end,
 )
 from cartpole_rl.identification.identify import Identification, identify, judged
@@ -39,7 +40,7 @@ from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.serial.plant import emulated_plant
 from cartpole_rl.plants.simulated import SimulatedPlant
-from cartpole_rl.plants.specs import Numbers, PlantOutput
+from cartpole_rl.plants.specs import Numbers, OneCartPlant, PlantOutput
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.rig.hardware import (
     Hardware,
@@ -113,6 +114,35 @@ def test_every_experiment_is_made_to_its_end(recordings: dict[str, Episode]) -> 
     assert not swing.motor[-round(7.5 / PERIOD) :].any()
 
 
+def test_the_last_value_sent_is_0_where_the_cart_reports_another_one() -> None:
+    sent = []
+
+    class Late(OneCartPlant):
+        def _set_seed(self, seed: int | None) -> None: ...
+
+        def step_one(self, motor: int) -> PlantOutput[Numbers]:
+            sent.append(motor)
+            return at_rest
+
+        def drove(self, given: int) -> int:
+            return 0
+
+        @property
+        def track_half_length(self) -> torch.Tensor:
+            return torch.tensor([0.38])
+
+    at_rest = PlantOutput((0, 2048), (PERIOD,), (0,), (False,), (False,))
+    task = Task.of(PERIOD, np.random.default_rng(0), nominal_hardware())
+    run(Late(), at_rest, hold(220, 0.1, task), task)
+    assert set(sent[:-1]) == {220}
+    assert sent[-1] == 0
+
+
+def test_a_shorter_track_than_that_of_the_file_is_kept_to() -> None:
+    hardware = nominal_hardware()
+    assert track_end(hardware, 0.2) < 0.2 < track_end(hardware) == track_end(hardware, 0.5)
+
+
 def test_the_cart_is_not_driven_after_the_last_experiment(make_plant: Callable) -> None:
     """Also after a fault or off the track: all experiments are then recorded."""
 
@@ -123,6 +153,8 @@ def test_the_cart_is_not_driven_after_the_last_experiment(make_plant: Callable) 
     resets = []
 
     class CountedPlant(SimulatedPlant):
+        track_half_length = torch.tensor([0.38])  # so that the guard lets it leave the track
+
         def _reset(self, *given: Any, **named: Any) -> TensorDict:
             resets.append(1)
             return super()._reset(*given, **named)

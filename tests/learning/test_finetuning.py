@@ -150,6 +150,8 @@ def test_unmeasured_transitions_are_left_out(over: Over, drive: Callable) -> Non
     after = whole["observation"][:, 12:]
     assert not torch.equal(chunks[1]["observation"][:, 0], after[:, 0])  # it observes the brake's values, ...
     torch.testing.assert_close(chunks[1]["observation"][:, -1], after[:, -1])  # ... until they are too old
+    late = replace(episode, time=episode.time + 0.04 * (np.arange(episode.steps + 1) > 20))
+    assert [each.shape[1] for each in recorded_chunks(late, over, MOTORS, None)] == [20, whole.shape[1] - 21]
     only = replace(lost, **{name: getattr(lost, name)[:1] for name in ("motor", "score", "reward")})
     assert recorded_chunks(only, over, MOTORS, None) == []
 

@@ -14,7 +14,7 @@ from cartpole_rl.errors import LinkError, PlantError
 from cartpole_rl.plants.serial.connection import WATCHDOG_PERIODS, Connection
 from cartpole_rl.plants.serial.errors import RefusedError, check_limits, check_rig, fault_error
 from cartpole_rl.plants.serial.link import SerialLink, now
-from cartpole_rl.plants.serial.port import open_port, resolved_port
+from cartpole_rl.plants.serial.port import UsbPort, found_ports, open_port, port_of, resolved_port
 from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.plants.serial.tracking import StateTracker
 from cartpole_rl.plants.settings import SerialSettings
@@ -73,6 +73,7 @@ class SerialCart:
         self.settings, self.hardware = settings, hardware or nominal_hardware()
         self._before_homing = before_homing
         self.port = settings.port  # once opened, the one that "auto" was resolved to
+        self._usb: UsbPort | None = None  # the device at that port, once opened, if it is on USB
         self._tracker = StateTracker()
         self._open_connection: Connection | None = None
         self._information: Info | None = None
@@ -90,12 +91,14 @@ class SerialCart:
         """Open the port, shake hands, disarm, learn whether the cart has a clock of its own; return INFO.
 
         Raises PortError if the port cannot be opened, LinkError if no cart answers on it, PlantError if its
-        board has another agent than `check_policy` required.
+        board has another agent than `check_policy` required. After a lost link another USB device than before
+        is not opened.
         """
         if self._open_connection is not None:
             return self.information
         settings = self.settings
-        self.port = resolved_port(settings.port)
+        self.port = port_of(self._usb, settings.port) if self._usb else resolved_port(settings.port)
+        self._usb = next((each for each in found_ports() if each.device == self.port), None)
         port = open_port(self.port, settings.baud, settings.write_timeout)
         with self._tracker.uncounted() as uncounted:
             link = SerialLink(port, uncounted)
@@ -196,12 +199,9 @@ class SerialCart:
     def start_policy(self) -> None:
         """Arm the motor and let the policy on the board drive, while `follow_policy` keeps it from stopping.
 
-        A HELLO in silence, which a lockstep emulator needs, would wake the policy of a cart with its own
-        clock: a cart that is not known to have one gets another chance to show it. Raises what `start`
-        raises, RefusedError if the board has no policy, and PlantError if it has another one than
-        `check_policy` required.
+        Raises what `start` raises, RefusedError if the board has no policy, and PlantError if it has another
+        one than `check_policy` required.
         """
-        self._connection.learn_clock()
         if self._required_policy is not None:
             self.info()
             self.check_policy(self._required_policy)
@@ -339,7 +339,12 @@ class SerialCart:
         self._tracker.forget_handed_out()
 
     def _check_round_trip(self) -> None:
-        """Raise LinkError if the link takes over a period. On a lockstep emulator no time passes."""
+        """Raise LinkError if the link takes over a period. On a lockstep emulator no time passes.
+
+        A cart that is not known to have its own clock gets another chance to show it: its states may have
+        failed to come while `open` listened.
+        """
+        self._connection.learn_clock()
         period = self.information.period_us * 1e-6
         if self.is_lockstep:
             return

@@ -24,7 +24,7 @@ from typing import TypeVar
 
 from cartpole_rl.errors import LinkError
 from cartpole_rl.plants.serial.errors import LONGEST_PERIOD_US, refusal
-from cartpole_rl.plants.serial.link import SerialLink, now
+from cartpole_rl.plants.serial.link import SerialLink, WriteTimeoutError, now
 from cartpole_rl.plants.serial.tracking import StateTracker
 from cartpole_rl.plants.settings import SerialSettings
 from cartpole_rl.rig.hardware import LARGEST_MOTOR
@@ -111,7 +111,8 @@ class Connection:
     ) -> Answer:
         """Send `before` and `message` until the cart answers `message`; return the answer.
 
-        The question is repeated `settings.retries` times or, if `within` is given, for `within` s.
+        The question is repeated `settings.retries` times or, if `within` is given, for `within` s, also where
+        the port takes no bytes for a while.
         Raises RefusedError or FaultError for a NACK, LinkError without an answer.
         """
         self._tracker.send_question()
@@ -124,7 +125,12 @@ class Connection:
         if math.isfinite(within):
             attempts, pause = count(), min(pause, within / 2)
         for _ in attempts:
-            asked.append(self.link.send(*before, message))
+            try:
+                asked.append(self.link.send(*before, message))
+            except WriteTimeoutError:
+                if now() < end < math.inf:
+                    continue
+                raise
             self.notice_backlog()
             self._asked_sequence, self._frames_asked = asked[-1], self.link.frames_sent
             deadline = min(end, now() + pause)

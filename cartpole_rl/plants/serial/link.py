@@ -27,6 +27,10 @@ def now() -> float:
     return time.perf_counter() if _CLOCK is None else time.clock_gettime(_CLOCK)
 
 
+class WriteTimeoutError(LinkError):
+    """The operating system took no bytes within the write timeout, or a part of them: it may do so later."""
+
+
 class SerialLink:
     """Both directions of one port. Times are those of `now`, in s."""
 
@@ -56,11 +60,13 @@ class SerialLink:
         return self.sequence
 
     def write(self, data: bytes) -> None:
-        """Write raw bytes within the port's write timeout. Raises LinkError."""
+        """Write raw bytes within the port's write timeout. Raises WriteTimeoutError, LinkError."""
         try:
             taken = self._taken_at_once(data)
             if taken < len(data):
                 self._port.write(data[taken:])
+        except serial.SerialTimeoutException as error:
+            raise WriteTimeoutError(f"{self.port} takes no bytes: {error}") from error
         except OSError as error:
             raise self._broken("written to", error) from error
         self.sent_at = now()

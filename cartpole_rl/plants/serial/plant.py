@@ -179,9 +179,9 @@ class SerialPlant(OneCartPlant):
 
         If the cart does not acknowledge the value, or its limits changed one, what drove is what it reports:
         the motor value in force. If its watchdog or a fault has just set the motor to 0, that was the value
-        of the period before.
+        of the period before; so it was if no value could be sent.
         """
-        drove = motor
+        drove = self._drove
 
         def answer() -> State:
             nonlocal drove

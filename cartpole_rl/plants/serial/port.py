@@ -45,6 +45,11 @@ class UsbPort:
     name: str = ""  # what the device calls itself
     serial_number: str = ""
 
+    @property
+    def identity(self) -> tuple[int, int, str]:
+        """What tells this device from another, wherever it is plugged in."""
+        return self.vendor, self.product, self.serial_number
+
 
 def open_port(port: str, baud: int, write_timeout: float) -> serial.SerialBase:
     """Open `port`, a device path or one of pyserial's URLs, for this process alone.
@@ -97,6 +102,22 @@ def set_exclusive(line: serial.SerialBase, exclusive: bool) -> None:
 def resolved_port(port: str) -> str:
     """Return `port`, or for "auto" the only port of this computer that may be a cart. Raises PortError."""
     return only_cart(found_ports()) if port == AUTO else port
+
+
+def port_of(earlier: UsbPort, port: str) -> str:
+    """Return where the device `earlier` is now that was at `port`. Raises PortError if another one is there.
+
+    A device may get another path when it is plugged in again. One without a serial number stands for all of
+    its kind.
+    """
+    ports = found_ports()
+    same = [each for each in ports if each.identity == earlier.identity]
+    if paths := [each.device for each in same if port in (AUTO, each.device)]:
+        return earlier.device if earlier.device in paths else paths[0]
+    raise PortError(
+        f"the cart's port ({described(earlier)}) is gone; there are {named(ports) or 'none'}: plug the same "
+        "cart in again, or start the command again for another one"
+    )
 
 
 def only_cart(ports: Iterable[UsbPort]) -> str:

@@ -77,13 +77,19 @@ def preflight(cart: SerialCart, faults: FaultClearing | None = None) -> Iterator
     try:
         for name, check in _checks(cart, faults or FaultClearing(0)).items():
             finding = _finding(name, check, cart)
+            if not finding.ready:
+                _stop(cart)  # before the caller shows it: the motor may still be on
             yield finding
             if not finding.ready:
                 return
     finally:
-        if cart.is_open:
-            with suppress(PlantError):  # the finding says why; the cart's watchdog stops it
-                cart.stop()
+        _stop(cart)
+
+
+def _stop(cart: SerialCart) -> None:
+    if cart.is_open:
+        with suppress(PlantError):  # the finding says why; the cart's watchdog stops it
+            cart.stop()
 
 
 def _checks(cart: SerialCart, faults: FaultClearing) -> dict[str, Callable[[], str]]:

@@ -13,6 +13,7 @@ from serial_peer import CartPeer, Peer, open_descriptors, quick_settings, wait_f
 
 from cartpole_rl.errors import LinkError, PortError
 from cartpole_rl.plants.serial.cart import LAST_STOP, LONGEST_STOP, SerialCart
+from cartpole_rl.plants.serial.link import WriteTimeoutError
 from cartpole_rl.plants.serial.port import why_not_open
 from cartpole_rl.plants.settings import LONGEST_WRITE, SerialSettings
 from cartpole_rl.signals import UNWINDING
@@ -202,6 +203,26 @@ def test_stop_is_repeated_through_noise_whatever_the_settings(settings: dict[str
         peer.answer = deaf
         cart.stop()
         assert len(peer.messages(Stop)) >= first + 4
+
+
+def test_stop_is_repeated_where_the_port_takes_no_bytes_for_a_while(monkeypatch: pytest.MonkeyPatch) -> None:
+    with CartPeer() as peer, SerialCart(quick_settings(peer.port)) as cart:
+        cart.start()
+        before, write, full = len(peer.messages(Stop)), cart._connection.link.write, [True] * 3
+
+        def fills(data: bytes) -> None:
+            if full and full.pop():
+                raise WriteTimeoutError("it takes no bytes")
+            write(data)
+
+        monkeypatch.setattr(cart._connection.link, "write", fills)
+        cart.stop()
+        assert not full
+        assert len(peer.messages(Stop)) == before + 1
+        assert not peer.flags & Flags.ARMED
+        full.extend([True] * 3)
+        with pytest.raises(WriteTimeoutError):
+            cart.info()
 
 
 def test_an_interrupted_end_sends_stop_once_more(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -367,6 +367,28 @@ def test_on_a_lockstep_cart_no_time_passes_on_the_way() -> None:
         assert len(peer.messages(Stop)) == stopped
 
 
+def test_a_cart_whose_states_failed_to_come_at_first_is_no_lockstep_cart() -> None:
+    """It is looked at once more before it is armed."""
+    with CartPeer() as peer, SerialCart(quick_settings(peer.port)) as cart:
+        assert cart.is_lockstep
+        peer.paced, ended = True, threading.Event()
+
+        def tick() -> None:
+            while not ended.wait(0.02):
+                peer.tick()
+
+        ticking = threading.Thread(target=tick)
+        ticking.start()
+        try:
+            stopped = len(peer.messages(Stop))
+            cart.start()
+            assert not cart.is_lockstep
+            assert len(peer.messages(Stop)) > stopped  # the round trip was measured
+        finally:
+            ended.set()
+            ticking.join()
+
+
 def test_a_device_that_never_pauses_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its bytes always wait, and none of them is an answer."""
     with CartPeer() as peer, SerialCart(quick_settings(peer.port)) as cart:

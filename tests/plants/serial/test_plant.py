@@ -208,6 +208,20 @@ def test_a_host_that_was_suspended_while_it_waited_is_a_lost_link(
     assert len(peer.messages(Home)) == 2
 
 
+def test_a_value_that_was_not_sent_is_not_recorded(
+    plant: SerialPlant, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plant.reset_one()
+    plant.step_one(50)
+
+    def suspended(value: int) -> int:
+        raise LinkError("did not answer")
+
+    monkeypatch.setattr(plant.cart, "set_motor", suspended)
+    assert plant.step_one(-50).truncated == (True,)
+    assert plant.drove(-50) == 50
+
+
 @pytest.mark.parametrize("side", [-1, 1])
 def test_beyond_the_soft_limit_the_episode_ends_on_the_track(
     peer: CartPeer, plant: SerialPlant, side: int

@@ -5,12 +5,15 @@ import os
 import re
 import struct
 import sys
+from dataclasses import replace
 
 import pytest
 from serial.tools.list_ports_common import ListPortInfo
 from serial_peer import CartPeer, Peer, quick_settings
 
 from cartpole_rl.errors import LinkError, PortError
+from cartpole_rl.plants.serial import cart as cart_module
+from cartpole_rl.plants.serial import port
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.port import (
     UsbPort,
@@ -20,6 +23,7 @@ from cartpole_rl.plants.serial.port import (
     found_ports,
     only_cart,
     open_port,
+    port_of,
     usb_ports,
 )
 from cartpole_rl.plants.settings import SerialSettings
@@ -77,6 +81,44 @@ def test_what_came_and_went() -> None:
 
 def test_the_only_cart_is_taken_whatever_else_there_is() -> None:
     assert only_cart([MODEM, CH340]) == "/dev/ttyUSB0"
+
+
+@pytest.mark.parametrize(
+    ("given", "now", "found"),
+    [
+        ("auto", [CH340, FTDI], "/dev/ttyUSB1"),
+        ("auto", [replace(FTDI, device="/dev/ttyUSB0")], "/dev/ttyUSB0"),
+        ("/dev/ttyUSB1", [CH340, FTDI], "/dev/ttyUSB1"),
+        ("auto", [CH340], None),
+        ("auto", [replace(FTDI, serial_number="other")], None),
+        ("/dev/ttyUSB1", [replace(CH340, device="/dev/ttyUSB1"), replace(FTDI, device="/dev/ttyUSB0")], None),
+    ],
+)
+def test_a_connection_that_was_lost_is_made_to_the_same_device(
+    given: str, now: list[UsbPort], found: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(port, "found_ports", lambda: now)
+    if found is not None:
+        assert port_of(FTDI, given) == found
+        return
+    with pytest.raises(
+        PortError, match=r"the cart's port \(FTDI .*A50285BI\) is gone; there are .*: plug the"
+    ):
+        port_of(FTDI, given)
+
+
+def test_another_cart_is_not_driven_after_the_first_was_unplugged(monkeypatch: pytest.MonkeyPatch) -> None:
+    with CartPeer() as first, CartPeer() as second:
+        plugged = [replace(FTDI, device=first.port)]
+        for module in (port, cart_module):
+            monkeypatch.setattr(module, "found_ports", lambda: plugged)
+        cart = SerialCart(quick_settings("auto"))
+        cart.open()
+        cart.close()
+        plugged[:] = [replace(FTDI, device=second.port, serial_number="other")]
+        with pytest.raises(PortError, match="plug the same cart in again"):
+            cart.open()
+        assert not second.received
 
 
 def test_of_several_a_person_chooses() -> None:

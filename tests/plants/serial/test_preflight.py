@@ -26,7 +26,7 @@ from cartpole_rl.plants.serial.preflight import (
 )
 from cartpole_rl.plants.settings import SerialSettings
 from cartpole_rl.rig.hardware import nominal_hardware
-from cartpole_rl.wire import Flags, Home, State
+from cartpole_rl.wire import Flags, Home, SetMotor, State
 
 TRUTH: dict[str, Any] = {
     "deadband_right": 100.0,
@@ -202,6 +202,17 @@ def test_a_cart_that_does_not_move_is_a_finding_with_its_remedy() -> None:
         "homing failed: the cart's count does not change: switch the motor's supply on, check the cables of "
         "the motor and of the cart's encoder, free the cart"
     )
+
+
+def test_the_motor_is_stopped_before_a_check_that_failed_is_shown() -> None:
+    """Whoever shows it may block: a terminal that was stopped, a full pipe."""
+    with CartPeer() as peer:
+        cart = SerialCart(SerialSettings(port=peer.port))
+        for finding in preflight(cart):
+            assert finding.ready or not peer.flags & Flags.ARMED
+        assert (finding.check, finding.ready) == ("cart encoder", False)
+        assert any(message.motor for message in peer.messages(SetMotor))
+        cart.close()
 
 
 def test_a_bad_cable_is_told_before_anything_moves() -> None:
