@@ -357,15 +357,16 @@ def test_learning_begins_without_a_fit_and_takes_a_later_one(
 def test_what_is_not_learned_from_is_told(
     late: CartLearner, recorded: list[Episode], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The cart's own brake drove in one period."""
-    motor = recorded[0].motor
-    odd = replace(recorded[0], motor=np.concatenate((motor[:10], [-255], motor[11:])))
-    steps = odd.measured_steps
-    assert [chunk.shape[1] for chunk in late.transitions(odd)] == [10, steps - 11]
+    """The cart's own brake drove in one period, then in a tenth of them."""
+    motor, steps = recorded[0].motor, recorded[0].measured_steps
+    assert len(late.transitions(replace(recorded[0], motor=np.r_[motor[:10], -255, motor[11:]]))) == 2
+    assert not capsys.readouterr().err
+    many = steps // 10
+    odd = replace(recorded[0], motor=np.r_[motor[:10], [-255] * many, motor[10 + many :]])
+    assert [chunk.shape[1] for chunk in late.transitions(odd)] == [10, steps - 10 - many]
     (line,) = capsys.readouterr().err.splitlines()
     assert line == (
-        f"cartpole-finetune: 1 of {steps} steps of an episode are not learned from: the cart's own brake or "
-        "a late command drove them, or their frame was late or lost"
+        f"cartpole-finetune: {many} of {steps} steps of an episode are not learned from: the cart's own "
+        "brake or a late command drove them, or their frame was late or lost"
     )
     assert [chunk.shape[1] for chunk in late.transitions(recorded[0])] == [steps]
-    assert not capsys.readouterr().err
