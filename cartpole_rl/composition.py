@@ -241,10 +241,11 @@ class _OwnChoices:
             names = [f"{group}.parameters.{name}" for name in values["parameters"]]
             if f"{group}.parameters" not in keys:
                 more += [f"++{name}=null" for name in names if name not in keys]
+        valued = {key_of(word) for word in words if not re.search("^~|=null$", word, re.IGNORECASE)}
         more += [
             f"++{periods}=null"
             for seconds, periods in IN_PERIODS.items()
-            if seconds in keys and periods not in keys and f"{seconds}=null" not in words
+            if seconds in valued and periods not in keys
         ]
         if kept := self._kept_by_emulator(keys):
             more.append(f"{KEPT}[{','.join(kept)}]")

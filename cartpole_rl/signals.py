@@ -66,7 +66,7 @@ class RaiseOnce:
         """Let the signal come again if Python swallowed its error; later, or it would swallow that too."""
         if (number := getattr(unraisable.exc_value, NUMBER, None)) is not None:
             self._raised_at = -UNWINDING
-            again = threading.Timer(AGAIN, signal.raise_signal, [number])
+            again = threading.Timer(AGAIN, send_to_main_thread, [number])
             again.daemon = True
             again.start()
         self._unraisable(unraisable)
@@ -76,6 +76,14 @@ class RaiseOnce:
         for number in numbers:
             if signal.getsignal(number) is self:
                 signal.signal(number, signal.SIG_IGN)
+
+
+def send_to_main_thread(number: int) -> None:
+    """Send a signal so that it ends what the main thread waits for; on Windows it comes after that."""
+    if hasattr(signal, "pthread_kill"):
+        signal.pthread_kill(threading.main_thread().ident or 0, number)
+    else:
+        signal.raise_signal(number)
 
 
 def starting_process() -> int:

@@ -202,7 +202,7 @@ def read_columns(path: Path, layout: Layout) -> dict[str, Array]:
         if isinstance(error, OSError):
             raise RecordingError(f"{path} cannot be read: {error.strerror}") from None
         raise NotALogError(f"{path} cannot be read: it is not UTF-8 text") from None
-    (number, names), numbered = heading_and_rows(text, layout)
+    (number, names), numbered = heading_and_rows(text, layout, wanted)
     if not numbered:
         raise NotALogError(f"{path} holds no rows; give a log with a line of column names")
     delimiter = layout.delimiter or found_delimiter(names, layout.decimal)
@@ -218,7 +218,9 @@ def read_columns(path: Path, layout: Layout) -> dict[str, Array]:
     return {name: _numbers(path, name, heading.index(name), rows, lines, layout) for name in wanted}
 
 
-def heading_and_rows(text: str, layout: Layout) -> tuple[tuple[int, str], list[tuple[int, str]]]:
+def heading_and_rows(
+    text: str, layout: Layout, wanted: Sequence[str]
+) -> tuple[tuple[int, str], list[tuple[int, str]]]:
     """Return the line of column names, and the rows, with their line numbers.
 
     NumPy writes the names as the last comment before the numbers.
@@ -229,10 +231,13 @@ def heading_and_rows(text: str, layout: Layout) -> tuple[tuple[int, str], list[t
     rows = [each for each, comment in zip(numbered, marked, strict=True) if not comment]
     if 0 < first < len(marked) and NUMBERS.fullmatch(rows[0][1]):
         number, names = numbered[first - 1]
-        names = names.lstrip().removeprefix(layout.comment)
-    else:
-        number, names = rows.pop(0) if rows else (0, "")
-    return (number, re.sub(r"^ *[#%] *", "", names)), rows
+        names = re.sub(r"^ *[#%] *", "", names.lstrip().removeprefix(layout.comment))
+        if all(name in names for name in wanted):
+            return (number, names), rows
+    number, names = rows.pop(0) if rows else (0, "")
+    if not any(name.startswith(("#", "%")) for name in wanted):
+        names = re.sub(r"^ *[#%] *", "", names)
+    return (number, names), rows
 
 
 def check_columns(path: Path, wanted: Sequence[str], present: Sequence[str]) -> None:

@@ -186,7 +186,8 @@ class Training(Resumable):
         losses, norms, errors = zip(*map(self.update, zip(*columns, strict=True)), strict=True)
         if prioritized:
             error = torch.cat(errors)
-            if not (largest := error.max().item()) < LARGEST_ERROR:
+            largest = error.max().item()
+            if not largest < LARGEST_ERROR ** (1 / max(1, self.buffer_settings.alpha)):
                 raise self.diverged(f"a squared error is {largest:g}")
             self.buffer.update_tensordict_priority(sample.set("td_error", error))
         loss, norm = (torch.stack(each).mean().item() for each in (losses, norms))

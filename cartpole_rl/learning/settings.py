@@ -24,7 +24,7 @@ class BufferSettings(Settings):
 
     kind: Literal["prioritized", "uniform"]
     size: Annotated[int, Field(ge=1, le=10**9)]  # transitions
-    alpha: Fraction  # TorchRL's priority is the squared error, so this acts doubled
+    alpha: NonNegative  # TorchRL's priority is the squared error, so this acts doubled
     beta: tuple[Fraction, Fraction]  # from the first to the last update, linearly
     priority_eps: Positive
 

@@ -87,7 +87,8 @@ class Plant(EnvBase):
     def to(self, device: torch.device | str) -> Self:
         """Return the plant if it is on `device`. Raises ConfigError for another one: it stays where it is."""
         wanted = torch.device(device)
-        if wanted.type != self.device.type or wanted.index not in (None, self.device.index):
+        both = {wanted.index, self.device.index}
+        if wanted.type != self.device.type or (None not in both and len(both) > 1):
             raise ConfigError(
                 f"the plant was made on {self.device}; make it on {device} in place of moving it"
             )

@@ -120,6 +120,7 @@ def test_a_cart_like_ip02_on_half_its_track_homes() -> None:
     assert home(cart.model_copy(update={"hardware": None}), "python")[1].fault == fault
 
 
+@pytest.mark.nightly
 def test_the_longest_track_is_searched_to_its_end() -> None:
     check_homes(EmulatorSettings(**COARSE).of_cart({"track_span": 6.0}))
 

@@ -269,7 +269,11 @@ HEAVY = {"cart_mass": 1.1, "pole_mass": 0.23, "pole_com": 0.33, "pole_inertia": 
 
 
 @pytest.mark.parametrize(
-    ("cart", "names"), [(LIGHT, ("coast", "levels", "square", "excite")), (HEAVY, ("excite",))]
+    ("cart", "names"),
+    [
+        pytest.param(LIGHT, ("coast", "levels", "square", "excite"), marks=pytest.mark.nightly),
+        (HEAVY, ("excite",)),
+    ],
 )
 def test_an_emulated_cart_keeps_within_0_3_m_at_long_periods(
     cart: dict[str, float], names: tuple[str, ...]

@@ -62,7 +62,10 @@ def trained(training: Training, iterations: int) -> dict[str, Tensor]:
     "overrides",
     [
         {"experiment": "recurrent", "guard": "none", "buffer": "uniform", "learning.carry": True},
-        {"pole": "range", "observation.pole_length": True, "learning.carry": False},
+        pytest.param(
+            {"pole": "range", "observation.pole_length": True, "learning.carry": False},
+            marks=pytest.mark.nightly,
+        ),
     ],
 )
 def test_a_training_is_on_its_device_saved_on_the_cpu_and_resumed(

@@ -172,6 +172,7 @@ def test_the_order_of_words_changes_nothing(group: str) -> None:
         (("learning=mine.yaml", "task=swingup", "task.duration=4"), (0.99, 0.0, 10, 200)),
         (("agent.horizon=0.5", "agent.gamma=0.9"), (0.9, 0.0, 1, 500)),
         (("agent.horizon=null",), (0.99, 0.0, 1, 500)),
+        (("++agent.horizon=Null", "~agent.action_time"), (0.99, 0.0, 1, 500)),
     ],
 )
 def test_seconds_that_a_person_gives_replace_control_periods(

@@ -78,6 +78,9 @@ class SerialCart:
         self._open_connection: Connection | None = None
         self._information: Info | None = None
         self._stop_unanswered = False
+        self._looked_again = (
+            False  # whether a cart without a clock was given time to show one before it moved
+        )
         self._required_policy: int | None = None  # identity of the only agent that may drive from the board
 
     def __enter__(self) -> Self:
@@ -98,8 +101,9 @@ class SerialCart:
             return self.information
         settings = self.settings
         self.port = port_of(self._usb, settings.port) if self._usb else resolved_port(settings.port)
-        self._usb = next((each for each in found_ports() if each.device == self.port), None)
         port = open_port(self.port, settings.baud, settings.write_timeout)
+        self._usb = self._usb or next((each for each in found_ports() if each.device == self.port), None)
+        self._looked_again = False
         with self._tracker.uncounted() as uncounted:
             link = SerialLink(port, uncounted)
             self._open_connection = Connection(link, settings, self._tracker)
@@ -341,10 +345,12 @@ class SerialCart:
     def _check_round_trip(self) -> None:
         """Raise LinkError if the link takes over a period. On a lockstep emulator no time passes.
 
-        A cart that is not known to have its own clock gets another chance to show it: its states may have
-        failed to come while `open` listened.
+        A cart that is not known to have its own clock gets another chance to show it, once a connection: its
+        states may have failed to come while `open` listened.
         """
-        self._connection.learn_clock()
+        if not self._looked_again:
+            self._connection.learn_clock()
+            self._looked_again = True
         period = self.information.period_us * 1e-6
         if self.is_lockstep:
             return

@@ -128,7 +128,7 @@ class Connection:
             try:
                 asked.append(self.link.send(*before, message))
             except WriteTimeoutError:
-                if now() < end < math.inf:
+                if now() + self._settings.write_timeout < end < math.inf:
                     continue
                 raise
             self.notice_backlog()

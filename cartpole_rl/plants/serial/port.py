@@ -107,13 +107,17 @@ def resolved_port(port: str) -> str:
 def port_of(earlier: UsbPort, port: str) -> str:
     """Return where the device `earlier` is now that was at `port`. Raises PortError if another one is there.
 
-    A device may get another path when it is plugged in again. One without a serial number stands for all of
-    its kind.
+    A device may get another path when it is plugged in again; of several without a serial number none is
+    taken for it.
     """
     ports = found_ports()
-    same = [each for each in ports if each.identity == earlier.identity]
-    if paths := [each.device for each in same if port in (AUTO, each.device)]:
-        return earlier.device if earlier.device in paths else paths[0]
+    paths = [each.device for each in ports if each.identity == earlier.identity]
+    if earlier.device in paths:
+        return earlier.device
+    if len(paths) == 1 and port == AUTO:
+        return paths[0]
+    if len(paths) == 1:
+        raise PortError(f"the cart that was at {port} is at {paths[0]} now: give plant.port={paths[0]}")
     raise PortError(
         f"the cart's port ({described(earlier)}) is gone; there are {named(ports) or 'none'}: plug the same "
         "cart in again, or start the command again for another one"
@@ -136,8 +140,11 @@ def only_cart(ports: Iterable[UsbPort]) -> str:
 
 
 def found_ports() -> list[UsbPort]:
-    """Return the USB serial ports of this computer."""
-    return usb_ports(list_ports.comports())
+    """Return the USB serial ports of this computer; none if one is unplugged while they are listed."""
+    try:
+        return usb_ports(list_ports.comports())
+    except (TypeError, OSError):  # of pyserial, where the system's files of a device vanish
+        return []
 
 
 def why_not_open(port: str, error: OSError | ValueError | OverflowError) -> str:

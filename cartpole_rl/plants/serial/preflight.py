@@ -74,16 +74,19 @@ def preflight(cart: SerialCart, faults: FaultClearing | None = None) -> Iterator
     and faults of the cart are findings too. `faults` decides whether a latched fault may be cleared; without
     it none is.
     """
+    stopped = False
     try:
         for name, check in _checks(cart, faults or FaultClearing(0)).items():
             finding = _finding(name, check, cart)
             if not finding.ready:
                 _stop(cart)  # before the caller shows it: the motor may still be on
+                stopped = True
             yield finding
             if not finding.ready:
                 return
     finally:
-        _stop(cart)
+        if not stopped:
+            _stop(cart)
 
 
 def _stop(cart: SerialCart) -> None:

@@ -91,7 +91,7 @@ def test_the_only_cart_is_taken_whatever_else_there_is() -> None:
         ("/dev/ttyUSB1", [CH340, FTDI], "/dev/ttyUSB1"),
         ("auto", [CH340], None),
         ("auto", [replace(FTDI, serial_number="other")], None),
-        ("/dev/ttyUSB1", [replace(CH340, device="/dev/ttyUSB1"), replace(FTDI, device="/dev/ttyUSB0")], None),
+        ("/dev/ttyUSB1", [replace(CH340, device="/dev/ttyUSB1")], None),
     ],
 )
 def test_a_connection_that_was_lost_is_made_to_the_same_device(
@@ -105,6 +105,18 @@ def test_a_connection_that_was_lost_is_made_to_the_same_device(
         PortError, match=r"the cart's port \(FTDI .*A50285BI\) is gone; there are .*: plug the"
     ):
         port_of(FTDI, given)
+
+
+def test_a_device_that_moved_is_named_and_of_two_alike_none_is_taken(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    moved = [replace(FTDI, device="/dev/ttyUSB0")]
+    monkeypatch.setattr(port, "found_ports", lambda: moved)
+    with pytest.raises(PortError, match=r"is at /dev/ttyUSB0 now: give plant.port=/dev/ttyUSB0"):
+        port_of(FTDI, "/dev/ttyUSB1")
+    moved[:] = [replace(CH340, device=f"/dev/ttyUSB{number}") for number in (1, 2)]
+    with pytest.raises(PortError, match="is gone"):
+        port_of(CH340, "auto")
 
 
 def test_another_cart_is_not_driven_after_the_first_was_unplugged(monkeypatch: pytest.MonkeyPatch) -> None:

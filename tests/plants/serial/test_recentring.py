@@ -65,8 +65,13 @@ def plant() -> Iterator[SerialPlant]:
     "truth",
     [
         {"cart_coulomb_left": 0.8, "cart_coulomb_right": 0.6, "latency": 0.023},
-        {"pole_mass": 0.23, "pole_com": 0.3302, "pole_inertia": 0.0079, "track_tilt": 0.0087},
-        {"pole_viscous": 1e-5, "pole_coulomb": 0.0, "pole_drag": 0.0},
+        pytest.param(
+            {"pole_mass": 0.23, "pole_com": 0.3302, "pole_inertia": 0.0079, "track_tilt": 0.0087},
+            marks=pytest.mark.nightly,
+        ),
+        pytest.param(
+            {"pole_viscous": 1e-5, "pole_coulomb": 0.0, "pole_drag": 0.0}, marks=pytest.mark.nightly
+        ),
     ],
     ids=["friction and latency", "large on a tilt", "no pole friction"],
 )
