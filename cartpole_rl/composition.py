@@ -395,12 +395,9 @@ def _alone(group: str, given: dict[str, Any]) -> dict[str, Any]:
     names = ONE_OF.get(group, ())
     if group == "randomization":
         return {name: _excluding(each, names) for name, each in given.items()}
-    seconds = {f"{group}.{name}" for name, value in given.items() if value is not None}
-    in_periods = [name for of, name in IN_PERIODS.items() if of in seconds]
-    return {
-        **dict.fromkeys(name.removeprefix(f"{group}.") for name in in_periods),
-        **_excluding(given, names),
-    }
+    valued = [f"{group}.{name}" for name, value in given.items() if value is not None]
+    in_periods = [IN_PERIODS[name].partition(".")[2] for name in valued if name in IN_PERIODS]
+    return {**dict.fromkeys(in_periods), **_excluding(given, names)}
 
 
 def _excluding(given: Any, names: Iterable[str]) -> Any:

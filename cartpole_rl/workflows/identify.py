@@ -124,6 +124,9 @@ def identify_cart(config: IdentifyConfig, folder: Path) -> None:
         check_recordings(by_file, held_out_by_file, config.control_period, bar.update)
     measured = shared_period(by_file | held_out_by_file)
     if not math.isclose(measured, config.control_period, rel_tol=CLOCK):
+        given = f"control_period={config.control_period:g}"
+        line = f"note: the recordings have a period of {measured:g} s, which is used in place of {given}"
+        print_message("identify", line)
         config = config.model_copy(update={"control_period": measured})
     if config.source is not None:
         write_config(folder, "identify", config.model_dump(mode="json", by_alias=True))

@@ -85,6 +85,10 @@ def test_the_cart_is_fitted_with_the_period_of_its_recordings(run: Path, tmp_pat
         words = "from=slower", "method=one_step", word, f"hydra.run.dir={folder}"
         done = in_process("identify", *words, folder=tmp_path)
         assert done.code == 0, done.err
+        note = (
+            "note: the recordings have a period of 0.0203 s, which is used in place of control_period=0.02\n"
+        )
+        assert (note in done.err) == (folder == "default")
         assert yaml.safe_load((tmp_path / folder / "config.yaml").read_text())["control_period"] == 0.0203
         found.append(json.loads((tmp_path / folder / "identification.json").read_text()))
     assert found[0] == found[1]

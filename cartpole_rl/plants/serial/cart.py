@@ -73,14 +73,12 @@ class SerialCart:
         self.settings, self.hardware = settings, hardware or nominal_hardware()
         self._before_homing = before_homing
         self.port = settings.port  # once opened, the one that "auto" was resolved to
-        self._usb: UsbPort | None = None  # the device at that port, once opened, if it is on USB
+        self._usb: UsbPort | None = None  # the cart's device, once it answered, if it is on USB
         self._tracker = StateTracker()
         self._open_connection: Connection | None = None
         self._information: Info | None = None
         self._stop_unanswered = False
-        self._looked_again = (
-            False  # whether a cart without a clock was given time to show one before it moved
-        )
+        self._looked_again = False  # a cart without a clock had more time to show one, before it moved
         self._required_policy: int | None = None  # identity of the only agent that may drive from the board
 
     def __enter__(self) -> Self:
@@ -102,7 +100,6 @@ class SerialCart:
         settings = self.settings
         self.port = port_of(self._usb, settings.port) if self._usb else resolved_port(settings.port)
         port = open_port(self.port, settings.baud, settings.write_timeout)
-        self._usb = self._usb or next((each for each in found_ports() if each.device == self.port), None)
         self._looked_again = False
         with self._tracker.uncounted() as uncounted:
             link = SerialLink(port, uncounted)
@@ -115,6 +112,7 @@ class SerialCart:
                 self._abandon()
                 raise
         link.statistics = self.statistics
+        self._usb = self._usb or next((each for each in found_ports() if each.device == self.port), None)
         if self._required_policy is not None:
             self.check_policy(self._required_policy)
         return self.information

@@ -29,9 +29,7 @@ class LinkStatistics:
     overtaken_frames: int = 0  # states that arrived after a newer one, and were dropped
     repeated_frames: int = 0  # states that arrived once more, and were dropped
     late_ticks: int = 0  # states passed over, or answered later than a period after they came
-    latency: deque[float] = field(
-        default_factory=latency_queue
-    )  # s, from a state's arrival to its command's end
+    latency: deque[float] = field(default_factory=latency_queue)  # s, from a state to its command's end
     loop_times: deque[float] = field(default_factory=latency_queue)  # s, see `latency_override`
 
     def summary(self) -> dict[str, float]:
