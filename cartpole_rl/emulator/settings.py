@@ -11,6 +11,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
+from cartpole_rl.checking import validated
 from cartpole_rl.choices import choice
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.rig.hardware import LARGEST_MOTOR, Hardware, hardware_of, nominal_hardware
@@ -22,6 +23,8 @@ ONBOARD = Path("onboard")  # as `policy`: the agent that is evaluated
 Port = Literal["auto", "pty", "tcp"]
 MotorValue = Annotated[float, Field(ge=0, le=LARGEST_MOTOR)]
 Coefficient = Annotated[float, Field(allow_inf_nan=False)]
+# numbers of a file that are added to those of the default cart
+ADDED = ("force_asymmetry", "motor_time_constant", "latency_jitter", "track_tilt", "angle_offset")
 
 
 class EmulatorSettings(Settings):
@@ -100,7 +103,7 @@ class EmulatorSettings(Settings):
         return self
 
     def of_cart(self, cart: Mapping[str, float]) -> Self:
-        """Return the settings of a cart with the hardware, masses, friction and force of a file's numbers.
+        """Return the settings of a cart with the hardware and the numbers of a file.
 
         Where these settings are still those of the default cart, and not `given`, they become those of one
         that differs from the file as the default cart differs from ip02's. A file with ip02's hardware
@@ -116,6 +119,9 @@ class EmulatorSettings(Settings):
 
         def times(name: str, of: str = "") -> float:
             return getattr(default, name) * numbers[of or name] / of_ip02[of or name]
+
+        def plus(name: str) -> float:
+            return getattr(default, name) + numbers[name] - of_ip02[name]
 
         start = zero_force_motor(numbers) / zero_force_motor(of_ip02)
         _, slope, constant = default.force_curve
@@ -137,15 +143,19 @@ class EmulatorSettings(Settings):
                 slope * numbers["force_linear"] / of_ip02["force_linear"],
                 constant * numbers["force_offset"] / of_ip02["force_offset"],
             ),
-            "deadband_left": min(start * default.deadband_left, LARGEST_MOTOR),
-            "deadband_right": min(start * default.deadband_right, LARGEST_MOTOR),
+            "cart_stiction_ratio": max(1.0, times("cart_stiction_ratio")),
+            "deadband_left": min(start * default.deadband_left + numbers["deadband_left"], LARGEST_MOTOR),
+            "deadband_right": min(start * default.deadband_right + numbers["deadband_right"], LARGEST_MOTOR),
+            "latency": max(0.0, plus("latency")),
+            **{name: plus(name) for name in ADDED},
         }
         changes = {
             name: value
             for name, value in scaled.items()
             if name not in self.given and getattr(self, name) == getattr(default, name)
         }
-        return type(self).model_validate({**self.model_dump(), **changes, "hardware": hardware})
+        values = {**self.model_dump(), **changes, "hardware": hardware}
+        return validated(type(self), values, lambda _: "the emulated cart of cart=: emulator.")
 
 
 def zero_force_motor(cart: Mapping[str, float]) -> float:
