@@ -81,7 +81,15 @@ def conf_folder() -> Path:
 
 
 def choice(name: str) -> dict[str, Any]:
-    """Return the content of a file in conf/, named like "train" or "task/swingup". Raises ConfigError."""
+    """Return the content of a file in conf/, named like "train" or "task/swingup". Raises ConfigError.
+
+    A choice of a group stands on top of those that it extends.
+    """
+    group, _, chosen = name.rpartition("/")
+    return load(group, chosen).values if group else _content(name)
+
+
+def _content(name: str) -> dict[str, Any]:
     file = conf_folder() / f"{name}.yaml"
     if not file.is_file():
         others = sorted(other.stem for other in file.parent.glob("*.yaml"))
@@ -137,7 +145,7 @@ def load(group: str, chosen: Choice, folder: Path = Path(), above: tuple[Path, .
         if above and not is_shipped(group, str(chosen)):
             remedy = nearest_choice(str(chosen), [*group_choices(group)])
             raise ConfigError(f"{group}={shown(above[-1])}: defaults: there is no choice {chosen}; {remedy}")
-        return _extended(group, chosen, choice(f"{group}/{chosen}") or {}, folder, above, False)
+        return _extended(group, chosen, _content(f"{group}/{chosen}") or {}, folder, above, False)
     path = folder / Path(str(chosen)).expanduser() if is_own_file(chosen) else beside
     if path.resolve() in above:
         raise ConfigError(f"{group}={above[0]}: {path} extends itself; extend a choice of another name")
