@@ -23,7 +23,7 @@ from cartpole_rl.plants.serial.errors import fault_error
 from cartpole_rl.plants.settings import SerialSettings
 from cartpole_rl.rig.hardware import hardware_of
 from cartpole_rl.signals import RaiseOnce, ending_signals
-from cartpole_rl.wire import Flags, seconds_between
+from cartpole_rl.wire.messages import Flags, seconds_between
 
 USAGE = "usage: drive_without_torch.py AGENT.npz PORT [POLE_LENGTH]"
 

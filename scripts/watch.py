@@ -18,7 +18,7 @@ from cartpole_rl.errors import FaultError, PlantError
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.settings import SerialSettings
 from cartpole_rl.signals import RaiseOnce, ending_signals
-from cartpole_rl.wire import Fault, Flags, State
+from cartpole_rl.wire.messages import Fault, Flags, State
 
 PERIODS_PER_LINE = 25
 BAUD_RATES = 921600, 115200  # of the protocol; the first is the default

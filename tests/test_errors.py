@@ -8,7 +8,7 @@ import pytest
 import cartpole_rl.workflows.finetune  # noqa: F401 - imports every module that defines an error
 from cartpole_rl.errors import CartPoleError
 from cartpole_rl.plants.serial.errors import NotReadyError, RefusedError
-from cartpole_rl.wire import Reason
+from cartpole_rl.wire.messages import Reason
 
 
 def descendants(kind: type[CartPoleError]) -> Iterator[type[CartPoleError]]:

@@ -18,9 +18,8 @@ from cartpole_rl.emulator.firmware import MOST_PENDING
 from cartpole_rl.emulator.guards import LEVER, micrometres
 from cartpole_rl.errors import EmulatorError
 from cartpole_rl.rig.hardware import Hardware, nominal_hardware
-from cartpole_rl.wire import Fault, Message, SetMotor
 from cartpole_rl.wire.frames import END, open_envelope
-from cartpole_rl.wire.messages import MESSAGES
+from cartpole_rl.wire.messages import MESSAGES, Fault, Message, SetMotor
 
 COMPILERS = ("cc", "gcc", "clang")
 FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-ffp-contract=off", f"-DCART_PENDING={MOST_PENDING}")

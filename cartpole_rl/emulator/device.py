@@ -12,7 +12,7 @@ from cartpole_rl.emulator.guards import lever_um
 from cartpole_rl.emulator.physics import CartPhysics
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.rig.hardware import nominal_hardware
-from cartpole_rl.wire import Message
+from cartpole_rl.wire.messages import Message
 
 BOOT_HANGING = 0.3  # largest distance from the middle with boot=hanging, share of the half length
 BOOT_ANYWHERE = 0.99  # the same with boot=anywhere

@@ -25,7 +25,7 @@ from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.plants.specs import Numbers, PlantOutput
 from cartpole_rl.scheduling import no_garbage_collection
 from cartpole_rl.tasks.episode import Ending, Episode
-from cartpole_rl.wire import Flags
+from cartpole_rl.wire.messages import Flags
 
 LATE_PERIODS = 1.5
 STOPPING = (Ending.TRACK, Ending.FAULT, Ending.LINK)  # the motor is at 0 in the last state

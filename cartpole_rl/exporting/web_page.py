@@ -33,9 +33,8 @@ from cartpole_rl.plants.simulated import Carts, Inputs, Period, commands_under_w
 from cartpole_rl.randomization.poles import Pole
 from cartpole_rl.rig.hardware import LARGEST_MOTOR
 from cartpole_rl.tasks.settings import Start
-from cartpole_rl.wire import Fault, Flags, Reason
 from cartpole_rl.wire.frames import LONGEST_FRAME, VERSION
-from cartpole_rl.wire.messages import MESSAGES
+from cartpole_rl.wire.messages import MESSAGES, Fault, Flags, Reason
 
 LONGEST_LATENCY = 0.04  # s, that the reader can choose, and the nominal one where that is longer
 RODS = [length / 100 for length in range(20, 101, 4)]  # m, poles that the reader can choose

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from cartpole_rl.rig.hardware import Hardware, nominal_hardware
 from cartpole_rl.tasks.episode import Array, Ending, Episode, wrap
-from cartpole_rl.wire import Fault
+from cartpole_rl.wire.messages import Fault
 
 LOGGER = logging.getLogger(__name__)
 

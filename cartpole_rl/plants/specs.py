@@ -15,7 +15,7 @@ from cartpole_rl.plants.serial.statistics import LinkStatistics
 from cartpole_rl.randomization.randomizer import Draws
 from cartpole_rl.rig.hardware import LARGEST_MOTOR, Hardware, nominal_hardware
 from cartpole_rl.tasks.episode import Ending, Origin
-from cartpole_rl.wire import Fault
+from cartpole_rl.wire.messages import Fault
 
 TERMINATING, TRUNCATING = (Ending.TRACK,), (Ending.FAULT, Ending.LINK)  # the endings that plants report
 

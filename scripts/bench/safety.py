@@ -43,7 +43,8 @@ from cartpole_rl.evaluation.episodes import run_episodes
 from cartpole_rl.plants.emulated import EmulatedCart
 from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.reporting.texts import Cell
-from cartpole_rl.wire import FrameSplitter, Home, Start, State, decode_frame
+from cartpole_rl.wire.frames import FrameSplitter, decode_frame
+from cartpole_rl.wire.messages import Home, Start, State
 from cartpole_rl.workflows.build import TrainedAgent, evaluated_env, evaluated_settings, trained_agent
 from cartpole_rl.workflows.config import EvaluateConfig
 

@@ -37,9 +37,17 @@ with fuzzer.instrument_imports(include=LIBRARIES) if fuzzer else contextlib.null
     from cartpole_rl.plants.serial import cart as serial_cart
     from cartpole_rl.plants.serial import connection
     from cartpole_rl.plants.settings import SerialSettings
-    from cartpole_rl.wire import Flags, FrameSplitter, SetMotor, Start, State, cobs, decode_frame
-    from cartpole_rl.wire.frames import END, LONGEST_FRAME, VERSION, crc16, open_envelope
-    from cartpole_rl.wire.messages import FROM_CART, MESSAGES
+    from cartpole_rl.wire import cobs
+    from cartpole_rl.wire.frames import (
+        END,
+        LONGEST_FRAME,
+        VERSION,
+        FrameSplitter,
+        crc16,
+        decode_frame,
+        open_envelope,
+    )
+    from cartpole_rl.wire.messages import FROM_CART, MESSAGES, Flags, SetMotor, Start, State
 
 from cartpole_rl.errors import CartPoleError, FrameError  # noqa: E402 - after what is instrumented
 

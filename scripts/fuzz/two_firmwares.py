@@ -31,20 +31,9 @@ from cartpole_rl.emulator import c_firmware
 from cartpole_rl.emulator.c_firmware import CFirmware
 from cartpole_rl.emulator.firmware import Firmware
 from cartpole_rl.rig.hardware import Hardware, hardware_of, nominal_hardware
-from cartpole_rl.wire import (
-    ClearFault,
-    FrameSplitter,
-    Hello,
-    Home,
-    Message,
-    SetMotor,
-    SetPeriod,
-    Start,
-    Stop,
-    cobs,
-    encode_frame,
-)
-from cartpole_rl.wire.frames import END, VERSION, crc16
+from cartpole_rl.wire import cobs
+from cartpole_rl.wire.frames import END, VERSION, FrameSplitter, crc16, encode_frame
+from cartpole_rl.wire.messages import ClearFault, Hello, Home, Message, SetMotor, SetPeriod, Start, Stop
 
 SANITIZERS = ("-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 SPLITTER_BYTES = 256  # at least the size of a cart_splitter

@@ -26,11 +26,20 @@ from collections.abc import Iterator
 
 from cartpole_rl.emulator.firmware import Firmware
 from cartpole_rl.errors import FrameError
-from cartpole_rl.wire import (
+from cartpole_rl.wire import cobs
+from cartpole_rl.wire.frames import (
+    END,
+    LONGEST_FRAME,
+    Envelope,
+    FrameSplitter,
+    decode_frame,
+    encode_frame,
+    open_envelope,
+)
+from cartpole_rl.wire.messages import (
     Ack,
     ClearFault,
     FaultReport,
-    FrameSplitter,
     Hello,
     Home,
     Info,
@@ -42,11 +51,7 @@ from cartpole_rl.wire import (
     StartPolicy,
     State,
     Stop,
-    cobs,
-    decode_frame,
-    encode_frame,
 )
-from cartpole_rl.wire.frames import END, LONGEST_FRAME, Envelope, open_envelope
 
 CHUNK = 4096  # bytes, as one read of a port returns
 TICK_EVERY = 64  # runs of bytes between two periods of the firmware

@@ -7,16 +7,8 @@ import pytest
 from firmwares import needs_compiler
 
 from cartpole_rl.emulator.c_firmware import compile_c, firmware_folder
-from cartpole_rl.wire import (
-    Fault,
-    FrameSplitter,
-    Hello,
-    Message,
-    StartPolicy,
-    State,
-    decode_frame,
-    encode_frame,
-)
+from cartpole_rl.wire.frames import FrameSplitter, decode_frame, encode_frame
+from cartpole_rl.wire.messages import Fault, Hello, Message, StartPolicy, State
 
 pytestmark = needs_compiler
 BENCH = Path(__file__).parents[1] / "support" / "loop" / "bench.c"

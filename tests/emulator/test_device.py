@@ -12,17 +12,8 @@ from firmwares import one_firmware, truth
 from cartpole_rl.emulator.device import CartDevice
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.rig.hardware import nominal_encoders
-from cartpole_rl.wire import (
-    Fault,
-    Flags,
-    Hello,
-    Home,
-    SetMotor,
-    SetPeriod,
-    Start,
-    Stop,
-    encode_frame,
-)
+from cartpole_rl.wire.frames import encode_frame
+from cartpole_rl.wire.messages import Fault, Flags, Hello, Home, SetMotor, SetPeriod, Start, Stop
 
 pytestmark = pytest.mark.usefixtures("each_firmware")
 

@@ -5,7 +5,8 @@ import pytest
 from cartpole_rl.emulator.link import Disturbance
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import FrameError
-from cartpole_rl.wire import SetMotor, decode_frame, encode_frame
+from cartpole_rl.wire.frames import decode_frame, encode_frame
+from cartpole_rl.wire.messages import SetMotor
 
 FRAME = encode_frame(SetMotor(-200), 4)[:-1]
 

@@ -13,17 +13,8 @@ from firmwares import one_firmware, truth
 
 from cartpole_rl.emulator.device import CartDevice
 from cartpole_rl.emulator.firmware import BANNER
-from cartpole_rl.wire import (
-    ClearFault,
-    Fault,
-    Flags,
-    Hello,
-    Home,
-    SetMotor,
-    Start,
-    State,
-    decode_frame,
-)
+from cartpole_rl.wire.frames import decode_frame
+from cartpole_rl.wire.messages import ClearFault, Fault, Flags, Hello, Home, SetMotor, Start, State
 
 pytestmark = pytest.mark.usefixtures("each_firmware")
 

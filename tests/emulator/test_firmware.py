@@ -3,7 +3,8 @@
 import pytest
 from firmwares import answering, make_firmware, motors_over
 
-from cartpole_rl.wire import (
+from cartpole_rl.wire.frames import Frame, decode_frame, encode_frame
+from cartpole_rl.wire.messages import (
     Ack,
     ClearFault,
     Fault,
@@ -21,10 +22,7 @@ from cartpole_rl.wire import (
     Start,
     State,
     Stop,
-    decode_frame,
-    encode_frame,
 )
-from cartpole_rl.wire.frames import Frame
 
 pytestmark = pytest.mark.usefixtures("each_firmware")
 

@@ -12,9 +12,15 @@ from hypothesis import strategies as st
 
 from cartpole_rl.emulator.firmware import BANNER
 from cartpole_rl.errors import FrameError
-from cartpole_rl.wire import Flags, FrameSplitter, Home, SetMotor, Start, State, decode_frame, encode_frame
-from cartpole_rl.wire.frames import LONGEST_FRAME, Envelope, open_envelope
-from cartpole_rl.wire.messages import MESSAGES, Message
+from cartpole_rl.wire.frames import (
+    LONGEST_FRAME,
+    Envelope,
+    FrameSplitter,
+    decode_frame,
+    encode_frame,
+    open_envelope,
+)
+from cartpole_rl.wire.messages import MESSAGES, Flags, Home, Message, SetMotor, Start, State
 
 pytestmark = pytest.mark.usefixtures("each_firmware")
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from firmwares import make_firmware
 
-from cartpole_rl.wire import FrameSplitter
+from cartpole_rl.wire.frames import FrameSplitter
 
 pytestmark = pytest.mark.usefixtures("each_firmware")
 

@@ -11,7 +11,8 @@ pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
 
 from driven_cart import Driven, homed
 
-from cartpole_rl.wire import (
+from cartpole_rl.wire.frames import decode_frame, encode_frame
+from cartpole_rl.wire.messages import (
     ClearFault,
     Fault,
     Flags,
@@ -23,8 +24,6 @@ from cartpole_rl.wire import (
     SetPeriod,
     Start,
     Stop,
-    decode_frame,
-    encode_frame,
 )
 
 pytestmark = pytest.mark.usefixtures("each_firmware")

@@ -6,7 +6,8 @@ import tty
 import serial
 
 from cartpole_rl.emulator.link import PtyLink
-from cartpole_rl.wire import FrameSplitter, SetMotor, decode_frame, encode_frame
+from cartpole_rl.wire.frames import FrameSplitter, decode_frame, encode_frame
+from cartpole_rl.wire.messages import SetMotor
 
 
 def test_a_host_that_does_not_read_loses_whole_frames_and_never_half_of_one():

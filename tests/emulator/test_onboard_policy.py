@@ -12,11 +12,13 @@ from firmwares import answering, motors_over, needs_compiler
 from cartpole_rl.emulator.c_firmware import CFirmware, build_library, compile_c
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import EmulatorError
-from cartpole_rl.wire import (
+from cartpole_rl.wire.frames import decode_frame, encode_frame
+from cartpole_rl.wire.messages import (
     Ack,
     Fault,
     Flags,
     Hello,
+    Message,
     MessageType,
     Nack,
     Reason,
@@ -26,10 +28,7 @@ from cartpole_rl.wire import (
     StartPolicy,
     State,
     Stop,
-    decode_frame,
-    encode_frame,
 )
-from cartpole_rl.wire.messages import Message
 
 pytestmark = needs_compiler
 SOFT = 16704  # counts, of the nominal track

@@ -18,7 +18,8 @@ from cartpole_rl.emulator.firmware import BANNER
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.plants.emulated import EmulatedCart
 from cartpole_rl.plants.serial.cart import SerialCart
-from cartpole_rl.wire import (
+from cartpole_rl.wire.frames import LONGEST_FRAME, encode_frame
+from cartpole_rl.wire.messages import (
     Ack,
     Flags,
     Hello,
@@ -30,9 +31,7 @@ from cartpole_rl.wire import (
     Start,
     State,
     Stop,
-    encode_frame,
 )
-from cartpole_rl.wire.frames import LONGEST_FRAME
 
 COARSE = {"physics_step": 1e-3}
 

@@ -20,7 +20,7 @@ from cartpole_rl.emulator.guards import FrozenCartWatch, FrozenPoleWatch
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.rig.hardware import Hardware, hardware_of, nominal_hardware
-from cartpole_rl.wire import Fault, Flags, SetMotor, SetPeriod, Start, State
+from cartpole_rl.wire.messages import Fault, Flags, SetMotor, SetPeriod, Start, State
 
 pytestmark = needs_compiler
 DEFAULT = EmulatorSettings()

@@ -13,7 +13,7 @@ from firmwares import needs_compiler
 
 from cartpole_rl.emulator.physics import STOP_BEHIND
 from cartpole_rl.rig.hardware import hardware_of
-from cartpole_rl.wire import ClearFault, Fault, Flags, Hello, Home, SetMotor, SetPeriod, Start, State
+from cartpole_rl.wire.messages import ClearFault, Fault, Flags, Hello, Home, SetMotor, SetPeriod, Start, State
 
 LEFT, RIGHT, BOTH = 1, 2, 3
 HAS_BOTH = Flags.LEFT_SWITCH | Flags.RIGHT_SWITCH

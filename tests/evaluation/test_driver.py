@@ -26,7 +26,7 @@ from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.plants.serial.preparation import Confirm
 from cartpole_rl.plants.settings import SerialSettings
 from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, TaskSettings
-from cartpole_rl.wire import ClearFault, Fault, Message, SetMotor, Stop
+from cartpole_rl.wire.messages import ClearFault, Fault, Message, SetMotor, Stop
 
 LONG = 100_000  # periods
 

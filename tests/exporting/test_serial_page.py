@@ -19,7 +19,8 @@ from shown_pages import needs_browser
 from cartpole_rl.envs.build import environment
 from cartpole_rl.plants.specs import Numbers, OneCartPlant, PlantOutput
 from cartpole_rl.rig.hardware import nominal_hardware
-from cartpole_rl.wire import Flags, Frame, Hello, Home, Info, SetMotor, Start, State, Stop
+from cartpole_rl.wire.frames import Frame
+from cartpole_rl.wire.messages import Flags, Hello, Home, Info, SetMotor, Start, State, Stop
 from cartpole_rl.workflows.build import TrainedAgent, network_of
 
 VECTORS = json.loads(Path("tests/wire/vectors.json").read_text(encoding="utf-8"))

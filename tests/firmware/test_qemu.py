@@ -21,7 +21,7 @@ from cartpole_rl.plants.serial.cart import SerialCart  # noqa: E402
 from cartpole_rl.plants.serial.errors import RefusedError  # noqa: E402
 from cartpole_rl.plants.settings import SerialSettings  # noqa: E402
 from cartpole_rl.rig.hardware import nominal_hardware  # noqa: E402
-from cartpole_rl.wire import Fault, Flags, State  # noqa: E402
+from cartpole_rl.wire.messages import Fault, Flags, State  # noqa: E402
 
 PUSH, FAR = 110, 400  # motor value, and counts from the middle: 9 mm
 SHUTTLE = Path(__file__).parents[1] / "support" / "shuttle"

@@ -21,7 +21,8 @@ from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.physics.dynamics import State as TrueState
 from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.plants.settings import SerialSettings
-from cartpole_rl.wire import Flags, Frame, SetMotor, Start, State
+from cartpole_rl.wire.frames import Frame
+from cartpole_rl.wire.messages import Flags, SetMotor, Start, State
 
 MOTORS = (-255, -100, 0, 255)
 PERIODS = 12

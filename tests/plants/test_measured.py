@@ -19,7 +19,7 @@ from cartpole_rl.plants.measured import measured_part
 from cartpole_rl.plants.recorded import RecordedPlant
 from cartpole_rl.rig.hardware import nominal_encoders
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.wire import Fault
+from cartpole_rl.wire.messages import Fault
 from cartpole_rl.workflows.build import evaluated_env, evaluated_settings, trained_agent
 from cartpole_rl.workflows.config import EvaluateConfig, load_settings
 

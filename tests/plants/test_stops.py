@@ -24,7 +24,7 @@ from cartpole_rl.identification.experiments import Experiment, Moves, Task, cond
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.plants.settings import SerialSettings
-from cartpole_rl.wire import Flags
+from cartpole_rl.wire.messages import Flags
 
 PERIOD_MS = 20
 WATCHDOG_MS = 3 * PERIOD_MS

@@ -11,7 +11,8 @@ from firmwares import UnderTest, answering, truth
 from cartpole_rl.emulator.c_firmware import CFirmware
 from cartpole_rl.emulator.device import CartDevice
 from cartpole_rl.rig.hardware import nominal_hardware
-from cartpole_rl.wire import Flags, Hello, Home, Info, Message, State, decode_frame, encode_frame
+from cartpole_rl.wire.frames import decode_frame, encode_frame
+from cartpole_rl.wire.messages import Flags, Hello, Home, Info, Message, State
 
 OTHER_PHYSICS = {
     "cart_mass": 0.8,

@@ -12,17 +12,8 @@ from firmwares import UnderTest, answering
 
 from cartpole_rl.errors import FrameError
 from cartpole_rl.plants.serial.cart import LEASE_RENEWAL_US
-from cartpole_rl.wire import (
-    Flags,
-    Frame,
-    FrameSplitter,
-    Hello,
-    Home,
-    Message,
-    State,
-    decode_frame,
-    encode_frame,
-)
+from cartpole_rl.wire.frames import Frame, FrameSplitter, decode_frame, encode_frame
+from cartpole_rl.wire.messages import Flags, Hello, Home, Message, State
 
 SILENCE = 200.0  # s, timeout of a test
 

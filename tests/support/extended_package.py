@@ -131,8 +131,8 @@ def agent_sees_the_energy(runs: Runs) -> None:
 
 def message_survives_the_wire(runs: Runs) -> None:
     from cartpole_rl.emulator.firmware import Firmware
-    from cartpole_rl.wire import Nack, Reason, decode_frame, encode_frame
-    from cartpole_rl.wire.messages import Battery, GetBattery
+    from cartpole_rl.wire.frames import decode_frame, encode_frame
+    from cartpole_rl.wire.messages import Battery, GetBattery, Nack, Reason
 
     for message in (GetBattery(), Battery(11_900), Battery(65_535)):
         assert decode_frame(encode_frame(message, 7)[:-1]).message == message

@@ -9,7 +9,7 @@ import pytest
 from cartpole_rl.emulator.c_firmware import COMPILERS, CFirmware
 from cartpole_rl.emulator.firmware import Firmware
 from cartpole_rl.emulator.settings import EmulatorSettings
-from cartpole_rl.wire import Message, SetMotor
+from cartpole_rl.wire.messages import Message, SetMotor
 
 KINDS: dict[str, type[Firmware] | type[CFirmware]] = {"python": Firmware, "c": CFirmware}
 one_firmware = pytest.mark.parametrize("each_firmware", ["python"], indirect=True)  # of `each_firmware`

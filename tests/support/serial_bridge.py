@@ -15,7 +15,7 @@ from browser import BROWSER
 from emulator_host import SILENCE, EmulatorHost
 
 from cartpole_rl.errors import FrameError
-from cartpole_rl.wire import Frame, FrameSplitter, decode_frame
+from cartpole_rl.wire.frames import Frame, FrameSplitter, decode_frame
 
 READ_SLICE = 0.05  # s
 

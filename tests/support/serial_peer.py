@@ -13,11 +13,10 @@ from pathlib import Path
 
 from cartpole_rl.plants.serial.connection import WATCHDOG_PERIODS
 from cartpole_rl.plants.settings import SerialSettings
-from cartpole_rl.wire import (
+from cartpole_rl.wire.frames import Frame, FrameSplitter, decode_frame, encode_frame
+from cartpole_rl.wire.messages import (
     Ack,
     Flags,
-    Frame,
-    FrameSplitter,
     Hello,
     Home,
     Info,
@@ -30,8 +29,6 @@ from cartpole_rl.wire import (
     StartPolicy,
     State,
     Stop,
-    decode_frame,
-    encode_frame,
     ticks_between,
 )
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from cartpole_rl.wire import microseconds_between, seconds_between, ticks_between, went_back
+from cartpole_rl.wire.messages import microseconds_between, seconds_between, ticks_between, went_back
 
 
 @pytest.mark.parametrize(

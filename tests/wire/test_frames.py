@@ -7,9 +7,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cartpole_rl.errors import FrameError
-from cartpole_rl.wire import Frame, FrameSplitter, Hello, SetMotor, State, cobs, decode_frame, encode_frame
-from cartpole_rl.wire.frames import LONGEST_FRAME, crc16, open_envelope
-from cartpole_rl.wire.messages import MESSAGES, Message, MessageType
+from cartpole_rl.wire import cobs
+from cartpole_rl.wire.frames import (
+    LONGEST_FRAME,
+    Frame,
+    FrameSplitter,
+    crc16,
+    decode_frame,
+    encode_frame,
+    open_envelope,
+)
+from cartpole_rl.wire.messages import MESSAGES, Hello, Message, MessageType, SetMotor, State
 
 LIMITS = {"B": (0, 255), "h": (-(2**15), 2**15 - 1), "H": (0, 2**16 - 1)}
 LIMITS |= {"i": (-(2**31), 2**31 - 1), "I": (0, 2**32 - 1)}

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from cartpole_rl.wire import Fault, FaultReport, Flags, MessageType, Reason, encode_frame
-from cartpole_rl.wire.frames import CRC_BYTES, HEADER_BYTES, LONGEST_FRAME
+from cartpole_rl.wire.frames import CRC_BYTES, HEADER_BYTES, LONGEST_FRAME, encode_frame
+from cartpole_rl.wire.messages import Fault, FaultReport, Flags, MessageType, Reason
 
 PAGE = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text(encoding="utf-8")
 VECTORS = json.loads((Path(__file__).parent / "vectors.json").read_text(encoding="utf-8"))["good"]

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from cartpole_rl.errors import FrameError
-from cartpole_rl.wire import FrameSplitter, MessageType, Reason, decode_frame, encode_frame
-from cartpole_rl.wire.messages import MESSAGES
+from cartpole_rl.wire.frames import FrameSplitter, decode_frame, encode_frame
+from cartpole_rl.wire.messages import MESSAGES, MessageType, Reason
 
 VECTORS = json.loads((Path(__file__).parent / "vectors.json").read_text(encoding="utf-8"))
 GOOD, DAMAGED, DIALOGUE = VECTORS["good"], VECTORS["damaged"], VECTORS["dialogue"]

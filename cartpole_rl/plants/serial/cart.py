@@ -20,7 +20,6 @@ from cartpole_rl.plants.serial.tracking import StateTracker
 from cartpole_rl.plants.settings import SerialSettings
 from cartpole_rl.rig.hardware import Hardware, nominal_hardware
 from cartpole_rl.terminal import waiting
-from cartpole_rl.wire import microseconds_between
 from cartpole_rl.wire.messages import (
     Ack,
     ClearFault,
@@ -35,6 +34,7 @@ from cartpole_rl.wire.messages import (
     StartPolicy,
     State,
     Stop,
+    microseconds_between,
 )
 
 LOGGER = logging.getLogger(__name__)

@@ -29,7 +29,8 @@ from cartpole_rl.plants.serial.tracking import StateTracker
 from cartpole_rl.plants.settings import SerialSettings
 from cartpole_rl.rig.hardware import LARGEST_MOTOR
 from cartpole_rl.terminal import beat
-from cartpole_rl.wire import (
+from cartpole_rl.wire.frames import END, OTHER_VERSION
+from cartpole_rl.wire.messages import (
     Ack,
     Flags,
     Hello,
@@ -42,7 +43,6 @@ from cartpole_rl.wire import (
     State,
     Stop,
 )
-from cartpole_rl.wire.frames import END, OTHER_VERSION
 
 Answer = TypeVar("Answer", bound=Message)
 

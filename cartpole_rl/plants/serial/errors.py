@@ -7,7 +7,7 @@ with other end switches: it would home against stops that are not there.
 
 from cartpole_rl.errors import FaultError, LinkError, PlantError
 from cartpole_rl.rig.hardware import LARGEST_MOTOR, Hardware
-from cartpole_rl.wire import Fault, Flags, Info, MessageType, Nack, Reason
+from cartpole_rl.wire.messages import Fault, Flags, Info, MessageType, Nack, Reason
 
 SPAN_TOLERANCE = 0.05  # share; homing accepts 3 %
 SHORTEST_PERIOD_US, LONGEST_PERIOD_US = 5_000, 100_000  # docs/protocol.md, SET_PERIOD

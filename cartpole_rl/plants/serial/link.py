@@ -12,7 +12,8 @@ import serial
 from cartpole_rl.errors import FrameError, LinkError
 from cartpole_rl.plants.serial.port import set_exclusive
 from cartpole_rl.plants.serial.statistics import LinkStatistics
-from cartpole_rl.wire import Frame, FrameSplitter, Message, decode_frame, encode_frame
+from cartpole_rl.wire.frames import Frame, FrameSplitter, decode_frame, encode_frame
+from cartpole_rl.wire.messages import Message
 
 # Linux's has this name; macOS counts the time asleep in its CLOCK_MONOTONIC, and Windows in perf_counter
 _CLOCK: int | None = getattr(time, "CLOCK_BOOTTIME", getattr(time, "CLOCK_MONOTONIC", None))

@@ -30,7 +30,7 @@ from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.errors import NotReadyError, fault_error
 from cartpole_rl.rig.hardware import Hardware
 from cartpole_rl.terminal import waiting
-from cartpole_rl.wire import State, seconds_between
+from cartpole_rl.wire.messages import State, seconds_between
 
 REST_SECONDS = 0.3
 REST_COUNTS = 2  # of the cart

@@ -34,7 +34,7 @@ from cartpole_rl.plants.specs import TERMINATING, TRUNCATING, Numbers, OneCartPl
 from cartpole_rl.rig.hardware import Hardware, hardware_of
 from cartpole_rl.rig.parameters import completed
 from cartpole_rl.tasks.episode import Ending
-from cartpole_rl.wire import Fault, Flags, State, seconds_between, ticks_between, went_back
+from cartpole_rl.wire.messages import Fault, Flags, State, seconds_between, ticks_between, went_back
 
 
 class SerialPlant(OneCartPlant):

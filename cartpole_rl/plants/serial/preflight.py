@@ -26,7 +26,7 @@ from cartpole_rl.plants.serial.moves import (
 from cartpole_rl.plants.serial.preparation import FaultClearing
 from cartpole_rl.rig.hardware import Hardware
 from cartpole_rl.terminal import waiting
-from cartpole_rl.wire import Fault, Flags, Info, State, seconds_between, ticks_between
+from cartpole_rl.wire.messages import Fault, Flags, Info, State, seconds_between, ticks_between
 
 FARTHEST = 0.08  # m from the middle: no check needs more
 LEAST_SPEED = 0.03  # m/s of the way back to the middle; slower would take long and show nothing

@@ -17,7 +17,7 @@ from cartpole_rl.plants.serial.errors import fault_words
 from cartpole_rl.plants.serial.link import now
 from cartpole_rl.plants.serial.moves import recentre
 from cartpole_rl.plants.settings import BoardSettings
-from cartpole_rl.wire import Flags, microseconds_between
+from cartpole_rl.wire.messages import Flags, microseconds_between
 
 LOGGER = logging.getLogger(__name__)
 

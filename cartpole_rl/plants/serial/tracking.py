@@ -18,7 +18,7 @@ from contextlib import contextmanager
 
 from cartpole_rl.plants.serial.errors import LONGEST_PERIOD_US
 from cartpole_rl.plants.serial.statistics import LinkStatistics
-from cartpole_rl.wire import (
+from cartpole_rl.wire.messages import (
     Flags,
     State,
     microseconds_between,

@@ -19,7 +19,7 @@ from cartpole_rl.plants.drivers.driver import Driver, Measurement
 from cartpole_rl.plants.settings import DriverSettings
 from cartpole_rl.rig.hardware import Encoders, hardware_of
 from cartpole_rl.rig.parameters import completed
-from cartpole_rl.wire import Fault
+from cartpole_rl.wire.messages import Fault
 
 RIG = hardware_of(choice("cart/stepper"))  # 25 um, 4096 counts a turn
 PERIOD_US = 10_000

@@ -17,7 +17,8 @@ from cartpole_rl.plants.serial.link import WriteTimeoutError
 from cartpole_rl.plants.serial.port import why_not_open
 from cartpole_rl.plants.settings import LONGEST_WRITE, SerialSettings
 from cartpole_rl.signals import UNWINDING
-from cartpole_rl.wire import Flags, Frame, Hello, SetMotor, Stop
+from cartpole_rl.wire.frames import Frame
+from cartpole_rl.wire.messages import Flags, Hello, SetMotor, Stop
 
 
 class TestOpening:

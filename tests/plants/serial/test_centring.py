@@ -6,7 +6,7 @@ import pytest
 
 from cartpole_rl.plants.serial.moves import GENTLE, Centring, nominal_deadband
 from cartpole_rl.rig.hardware import nominal_hardware
-from cartpole_rl.wire import State
+from cartpole_rl.wire.messages import State
 
 IP02 = nominal_hardware()
 PERIOD_US = 20_000

@@ -14,7 +14,7 @@ from cartpole_rl.errors import LinkError
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.link import now
 from cartpole_rl.plants.serial.tracking import LARGEST_RATE_ERROR, ClockComparison
-from cartpole_rl.wire import Flags
+from cartpole_rl.wire.messages import Flags
 
 PERIOD = 0.02  # s by the cart's clock
 WRONG, RIGHT = (1.3, 0.6, 1.02, 0.985), (1.0, 1.005, 0.995)

@@ -13,11 +13,12 @@ from cartpole_rl.plants.serial import connection
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.errors import RefusedError
 from cartpole_rl.plants.serial.link import SerialLink
-from cartpole_rl.wire import (
+from cartpole_rl.wire import cobs
+from cartpole_rl.wire.frames import END, Frame, crc16
+from cartpole_rl.wire.messages import (
     Ack,
     Fault,
     Flags,
-    Frame,
     Hello,
     Home,
     Nack,
@@ -27,9 +28,7 @@ from cartpole_rl.wire import (
     StartPolicy,
     State,
     Stop,
-    cobs,
 )
-from cartpole_rl.wire.frames import END, crc16
 
 
 def test_a_question_that_was_lost_is_repeated() -> None:

@@ -11,7 +11,8 @@ from serial_peer import CartPeer, Forgetful, quick_settings, wait_for
 
 from cartpole_rl.errors import LinkError
 from cartpole_rl.plants.serial.cart import SerialCart
-from cartpole_rl.wire import Frame, Hello, Nack, Reason, SetMotor, Stop
+from cartpole_rl.wire.frames import Frame
+from cartpole_rl.wire.messages import Hello, Nack, Reason, SetMotor, Stop
 
 PERIODS = 15  # a pause; the watchdog waits for three
 

@@ -14,7 +14,8 @@ from cartpole_rl.errors import FaultError, LinkError, PortError
 from cartpole_rl.plants.serial.errors import NotReadyError
 from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.rig.hardware import nominal_hardware
-from cartpole_rl.wire import ClearFault, Fault, Flags, Frame, Home, SetMotor, Start, Stop
+from cartpole_rl.wire.frames import Frame
+from cartpole_rl.wire.messages import ClearFault, Fault, Flags, Home, SetMotor, Start, Stop
 
 
 @pytest.fixture

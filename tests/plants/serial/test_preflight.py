@@ -26,7 +26,7 @@ from cartpole_rl.plants.serial.preflight import (
 )
 from cartpole_rl.plants.settings import SerialSettings
 from cartpole_rl.rig.hardware import nominal_hardware
-from cartpole_rl.wire import Flags, Home, SetMotor, State
+from cartpole_rl.wire.messages import Flags, Home, SetMotor, State
 
 TRUTH: dict[str, Any] = {
     "deadband_right": 100.0,

@@ -10,7 +10,8 @@ from tensordict import TensorDict
 
 from cartpole_rl.errors import PlantError
 from cartpole_rl.plants.serial.plant import SerialPlant
-from cartpole_rl.wire import Frame, Start
+from cartpole_rl.wire.frames import Frame
+from cartpole_rl.wire.messages import Start
 
 
 @pytest.fixture

@@ -18,7 +18,8 @@ from cartpole_rl.plants.serial.errors import NotReadyError
 from cartpole_rl.plants.serial.moves import recentre
 from cartpole_rl.plants.serial.plant import SerialPlant, emulated_plant
 from cartpole_rl.plants.settings import SerialSettings
-from cartpole_rl.wire import Fault, Flags, Frame
+from cartpole_rl.wire.frames import Frame
+from cartpole_rl.wire.messages import Fault, Flags
 
 TURN = 4096
 MIDDLE = 100  # counts, 2.3 mm

@@ -11,7 +11,7 @@ from serial_peer import CartPeer
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import ConfigError, LinkError, PlantError
 from cartpole_rl.plants.settings import SerialSettings
-from cartpole_rl.wire import Flags
+from cartpole_rl.wire.messages import Flags
 from cartpole_rl.workflows.build import evaluated_env, evaluated_settings
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig, load_settings
 

@@ -9,7 +9,8 @@ from serial_peer import CartPeer, Forgetful, quick_settings, wait_for
 from cartpole_rl.errors import LinkError
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.link import now
-from cartpole_rl.wire import Frame, Hello, SetMotor
+from cartpole_rl.wire.frames import Frame
+from cartpole_rl.wire.messages import Hello, SetMotor
 
 
 def leave_unread(peer: CartPeer, waiting: int, thrown_away: int) -> None:

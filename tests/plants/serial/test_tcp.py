@@ -17,7 +17,8 @@ from cartpole_rl.errors import EmulatorError, LinkError, PortError
 from cartpole_rl.plants.emulated import EmulatedCart
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.port import open_port
-from cartpole_rl.wire import FrameSplitter, SetMotor, State, decode_frame, encode_frame
+from cartpole_rl.wire.frames import FrameSplitter, decode_frame, encode_frame
+from cartpole_rl.wire.messages import SetMotor, State
 
 
 def truth(**settings: object) -> EmulatorSettings:

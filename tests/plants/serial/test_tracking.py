@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from cartpole_rl.plants.serial.tracking import IDLE_TICKS, StateTracker
-from cartpole_rl.wire import Flags, State
+from cartpole_rl.wire.messages import Flags, State
 
 
 def state_at(tick: int) -> State:

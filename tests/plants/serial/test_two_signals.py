@@ -10,7 +10,7 @@ from pathlib import Path
 from serial_peer import INFO, HomingForever, wait_for
 
 from cartpole_rl.signals import UNWINDING
-from cartpole_rl.wire import Flags, Home, Stop
+from cartpole_rl.wire.messages import Flags, Home, Stop
 
 PREFLIGHT = (sys.executable, "-m", "cartpole_rl.cli", "preflight")
 

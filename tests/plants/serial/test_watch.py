@@ -10,7 +10,8 @@ from pathlib import Path
 
 from serial_peer import CartPeer, HomingForever, wait_for
 
-from cartpole_rl.wire import ClearFault, Fault, Frame, Home, Nack, Reason, SetMotor, Start, Stop
+from cartpole_rl.wire.frames import Frame
+from cartpole_rl.wire.messages import ClearFault, Fault, Home, Nack, Reason, SetMotor, Start, Stop
 
 SCRIPT = Path(__file__).parents[3] / "scripts/watch.py"
 OUTPUT_SPEED = 5  # of termios.tcgetattr
