@@ -9,7 +9,8 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import FrameType
 
 # s after a signal during which others are ignored: they would interrupt the unwinding. Stopping a cart that
@@ -76,6 +77,20 @@ class RaiseOnce:
         for number in numbers:
             if signal.getsignal(number) is self:
                 signal.signal(number, signal.SIG_IGN)
+
+
+@contextmanager
+def until_stopped() -> Iterator[None]:
+    """End the block without an error on SIGINT, SIGTERM or SIGHUP; a second does not end its unwinding."""
+    interrupt = RaiseOnce(lambda number: KeyboardInterrupt())
+    before = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, *ending_signals())}
+    try:
+        yield
+    except KeyboardInterrupt:
+        return
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def send_to_main_thread(number: int) -> None:

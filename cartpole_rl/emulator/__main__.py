@@ -9,7 +9,7 @@ import sys
 
 from pydantic import ValidationError
 
-from cartpole_rl.emulator.process import run
+from cartpole_rl.emulator.device import run
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import CartPoleError, ConfigError
 from cartpole_rl.signals import end_with_parent, starting_process

@@ -1,17 +1,27 @@
-"""The emulated cart as a whole: firmware, physics, encoders and a person's hand, period by period."""
+"""The emulated cart as a whole: firmware, physics, encoders and a person's hand, period by period.
+
+`run` makes it a process with a port that a host can open, and one of two clocks.
+"""
 
 import json
 import math
+import os
 import random
+import sys
+import time
+from collections import deque
 from pathlib import Path
 from typing import Any, Literal
 
 from cartpole_rl.emulator.c_firmware import CFirmware
 from cartpole_rl.emulator.firmware import BANNER, Firmware
 from cartpole_rl.emulator.guards import lever_um
+from cartpole_rl.emulator.link import Channel, open_link
 from cartpole_rl.emulator.physics import CartPhysics
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.rig.hardware import nominal_hardware
+from cartpole_rl.scheduling import take_precedence
+from cartpole_rl.signals import until_stopped
 from cartpole_rl.wire.messages import Message
 
 BOOT_HANGING = 0.3  # largest distance from the middle with boot=hanging, share of the half length
@@ -21,6 +31,7 @@ STANDS_WITHIN = math.radians(5)  # of upright, the pole stands
 STANDS_US = 2_000_000  # that it has to stand before a hand knocks it
 HAND_ERROR = 0.03  # rad, largest error of a hand that holds the pole upright
 LOOK_US = 1000  # between two looks of the firmware at the cart's position
+HOMING_US = 100_000  # that pass for each frame while the cart homes; the host asks as often
 
 
 class CartDevice:
@@ -245,3 +256,80 @@ def nearest_upright(angle: float) -> float:
 def microseconds(seconds: float | None) -> int | None:
     """Return whole microseconds; None, which means never, stays None."""
     return None if seconds is None else round(seconds * 1e6)
+
+
+def run(settings: EmulatorSettings) -> None:
+    """Print one JSON line with `port` and `pid`, and emulate until SIGINT, SIGTERM, SIGHUP or `unplug_at`.
+
+    Main thread only. Raises EmulatorError if MuJoCo is missing, or pseudo-terminals for `port` pty.
+    """
+    cart = CartDevice(settings)
+    with until_stopped(), open_link(settings.port) as link:
+        print(json.dumps({"port": link.port, "pid": os.getpid()}), flush=True)
+        if sys.stderr.isatty():  # a person, not a program that reads the line
+            print(f"next, in another terminal: cartpole-preflight plant.port={link.port}", file=sys.stderr)
+        clock = run_lockstep if settings.clock == "lockstep" else run_real
+        clock(cart, Channel(link, settings))
+        print(f"the cable was pulled after {settings.unplug_at:g} s (unplug_at)", file=sys.stderr)
+
+
+def run_lockstep(cart: CartDevice, channel: Channel) -> None:
+    """Pass one period for each frame from the host, including lost and damaged ones, without a clock.
+
+    If a STATE is lost, late or damaged, further periods pass until one arrives undamaged. So a host that
+    sends a frame always receives a STATE. While the cart homes, further periods pass, `HOMING_US` in all.
+    """
+    waiting: deque[bytes | None] = deque()
+    while not cart.unplugged:
+        if not waiting:
+            waiting.extend(channel.receive())
+            continue
+        handle(cart, channel, waiting.popleft(), cart.now_us)
+        end_us = cart.now_us + HOMING_US
+        while not pass_period(cart, channel, cart.period_end_us) or (
+            cart.firmware.homing and cart.now_us < end_us
+        ):
+            pass
+
+
+def run_real(cart: CartDevice, channel: Channel) -> None:
+    """Pass one period every 20 ms of the monotonic clock, with deadlines that do not drift.
+
+    Commands get a time stamp on arrival; the physics of a period is computed at its end. If this process was
+    held up, the period lasts until now, as on a board, instead of many periods in a row. What waited
+    meanwhile counts as having arrived in time.
+    """
+    take_precedence()  # a real cart would not be late either
+    boot, rate = time.monotonic(), cart.clock_rate
+
+    def now_us() -> int:
+        return int((time.monotonic() - boot) * rate * 1e6)
+
+    while not cart.unplugged:
+        end_us, left_us = cart.period_end_us, 1
+        while left_us > 0:
+            left_us = end_us - now_us()
+            for frame in channel.receive(max(0, left_us) / 1e6 / rate):
+                handle(cart, channel, frame, min(max(now_us(), cart.now_us), end_us))
+        late_us = now_us() - end_us
+        pass_period(cart, channel, end_us + late_us if late_us > cart.firmware.period_us // 2 else end_us)
+
+
+def pass_period(cart: CartDevice, channel: Channel, end_us: int) -> bool:
+    """Pass a period and send its frames, unless the cable was pulled during it.
+
+    Returns whether the STATE was sent undamaged or the cable is pulled.
+    """
+    frames = cart.pass_period(end_us)
+    return cart.unplugged or send_all(channel, frames)
+
+
+def handle(cart: CartDevice, channel: Channel, frame: bytes | None, now_us: int) -> None:
+    """Give the cart a frame, unless it was lost (None), and send the answer."""
+    if frame is not None:
+        send_all(channel, cart.receive(frame, now_us))
+
+
+def send_all(channel: Channel, frames: list[bytes]) -> bool:
+    """Send frames in order; return whether the last one was sent undamaged."""
+    return [channel.send(frame) for frame in frames][-1:] == [True]

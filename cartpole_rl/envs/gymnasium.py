@@ -56,13 +56,13 @@ from gymnasium.error import ResetNeeded
 from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
+from cartpole_rl import MAX_EPISODE_STEPS
 from cartpole_rl.checking import nearest_choice
 from cartpole_rl.choices import choice
 from cartpole_rl.drawing.window import has_display
 from cartpole_rl.envs.settings import CartPoleSettings
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.plants.settings import SimulatedSettings
-from cartpole_rl.registration import MAX_EPISODE_STEPS
 from cartpole_rl.scheduling import no_garbage_collection
 from cartpole_rl.terminal import waiting
 

@@ -1,7 +1,7 @@
 """Pure functions from frames to measured state, memory, observation, reward, scores and endings.
 
 They are the same for simulated and real carts. Every tensor is [k, N], the transpose of the tensordict's, so
-that compiled code runs along the carts; `one_cart.py` makes plain arithmetic for one cart of these functions.
+that compiled code runs along the carts; `OneCart` makes plain arithmetic for one cart of these functions.
 """
 
 from typing import Generic, NamedTuple

@@ -24,7 +24,7 @@ from cartpole_rl.errors import CartPoleError, LinkError
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy, Weights
 from cartpole_rl.evaluation.episodes import run_batch, warm_up
 from cartpole_rl.plants.serial.preparation import Confirm, nobody
-from cartpole_rl.plants.serial.statistics import LinkStatistics
+from cartpole_rl.plants.serial.tracking import LinkStatistics
 from cartpole_rl.scheduling import take_precedence
 from cartpole_rl.signals import UNWINDING, RaiseOnce, end_with_parent, ending_signals
 from cartpole_rl.tasks.episode import Episode

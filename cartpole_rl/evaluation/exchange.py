@@ -22,6 +22,7 @@ from gymnasium import spaces, spec
 from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
+from cartpole_rl import ENVIRONMENTS
 from cartpole_rl.envs.build import make_env, shipped_settings
 from cartpole_rl.envs.gymnasium import OF_TASK, TAKEN, float32
 from cartpole_rl.envs.settings import CartPoleSettings
@@ -41,7 +42,6 @@ from cartpole_rl.evaluation.recordings import (
 )
 from cartpole_rl.files import replacing
 from cartpole_rl.plants.recorded import RecordedPlant
-from cartpole_rl.registration import ENVIRONMENTS
 from cartpole_rl.rig.hardware import LARGEST_MOTOR, hardware_of
 from cartpole_rl.tasks.episode import Ending, Episode
 

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from cartpole_rl import drawing
 from cartpole_rl.compilation import Trace, trace
-from cartpole_rl.drawing import pages
 from cartpole_rl.envs.perception import Percept, Previous, perceive, perceive_first
 from cartpole_rl.envs.settings import CartPoleSettings, TrackGuard
 from cartpole_rl.plants.specs import PlantOutput
@@ -25,7 +25,7 @@ NO_SPEEDS = torch.zeros(0, 1)  # rewards and scores alone need them
 
 def filled(template: str, values: Mapping[str, object]) -> str:
     """Return the content of a template with `values` in place of @@name@@."""
-    return pages.filled(TEMPLATES / template, values)
+    return drawing.filled(TEMPLATES / template, values)
 
 
 class Graph(NamedTuple):

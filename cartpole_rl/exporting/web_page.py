@@ -16,7 +16,7 @@ from torch import Tensor
 
 from cartpole_rl.arithmetic.languages import JAVASCRIPT
 from cartpole_rl.arithmetic.writer import Writer
-from cartpole_rl.drawing.pages import shared_parts
+from cartpole_rl.drawing import shared_parts
 from cartpole_rl.envs.settings import CartPoleSettings
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.exporting.agent import FLOATS, ExportedAgent

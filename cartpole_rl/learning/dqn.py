@@ -20,10 +20,9 @@ from torchrl.objectives.utils import dispatch_value_estimator, distance_loss
 from cartpole_rl.compilation import Columns, LossGradient, acting_with
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import LearningError
-from cartpole_rl.learning.replay import make_buffer
 from cartpole_rl.learning.retries import Retries
 from cartpole_rl.learning.settings import BufferSettings, LearningSettings, OptimizerSettings, linear
-from cartpole_rl.learning.states import Resumable
+from cartpole_rl.learning.states import Resumable, make_buffer
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.tasks.settings import Measure
 

@@ -11,7 +11,7 @@ from torchrl.envs import EnvBase
 
 from cartpole_rl.errors import ConfigError, PlantError
 from cartpole_rl.physics.dynamics import State
-from cartpole_rl.plants.serial.statistics import LinkStatistics
+from cartpole_rl.plants.serial.tracking import LinkStatistics
 from cartpole_rl.randomization.randomizer import Draws
 from cartpole_rl.rig.hardware import LARGEST_MOTOR, Hardware, nominal_hardware
 from cartpole_rl.tasks.episode import Ending, Origin

@@ -15,16 +15,21 @@ from numpy.typing import NDArray
 
 from cartpole_rl.drawing import colours
 from cartpole_rl.identification.experiments import EXPERIMENTS, HELD_OUT
-from cartpole_rl.identification.identify import Candidate, Identification, PredictionError
+from cartpole_rl.identification.identify import (
+    Candidate,
+    Identification,
+    PredictionError,
+    Quantity,
+    intervals,
+)
 from cartpole_rl.identification.prediction import Replayed
-from cartpole_rl.identification.quantities import Quantity, intervals
 from cartpole_rl.identification.sensors import delayed
 from cartpole_rl.physics.friction import viscous_coefficient
 from cartpole_rl.physics.laws import Law
 from cartpole_rl.physics.parameters import CartParameters, cart_column
 from cartpole_rl.reporting import style, texts
 from cartpole_rl.reporting.episodes import wrapped_line
-from cartpole_rl.reporting.page import document, escaped, table
+from cartpole_rl.reporting.style import document, escaped, table
 from cartpole_rl.reporting.texts import interval_text, number_text
 from cartpole_rl.rig.hardware import LARGEST_MOTOR
 from cartpole_rl.run_folder import FIGURES

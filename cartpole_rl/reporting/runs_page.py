@@ -13,7 +13,6 @@ from PIL import Image
 
 from cartpole_rl.reporting.animation import smaller
 from cartpole_rl.reporting.groups import Drawing, drawings
-from cartpole_rl.reporting.page import document, escaped, table
 from cartpole_rl.reporting.results import (
     GOOD,
     Agent,
@@ -33,7 +32,7 @@ from cartpole_rl.reporting.statistics import (
     paired_improvement,
     probability_of_improvement,
 )
-from cartpole_rl.reporting.style import svg
+from cartpole_rl.reporting.style import document, escaped, svg, table
 from cartpole_rl.reporting.texts import count_text, number_text
 from cartpole_rl.run_folder import ANIMATION, FIGURES, TABLE
 

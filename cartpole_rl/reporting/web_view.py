@@ -25,7 +25,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from cartpole_rl.drawing.pages import filled, shared_parts
+from cartpole_rl.drawing import filled, shared_parts
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.snapshots import Memory, new_memory, read
 from cartpole_rl.reporting.live_view import LiveView

@@ -1,11 +1,14 @@
-"""Frames: COBS of (version u8, type u8, sequence u8, flags u8, payload, CRC-16 little-endian), then 0x00."""
+"""Frames: COBS of (version u8, type u8, sequence u8, flags u8, payload, CRC-16 little-endian), then 0x00.
+
+Consistent Overhead Byte Stuffing gives bytes without 0x00, so that 0x00 can end a frame. Source: Cheshire and
+Baker, "Consistent Overhead Byte Stuffing", IEEE/ACM ToN 7(2), 1999.
+"""
 
 import binascii
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 from cartpole_rl.errors import FrameError
-from cartpole_rl.wire import cobs
 from cartpole_rl.wire.messages import MESSAGES, Message
 
 VERSION = 2
@@ -13,6 +16,7 @@ OTHER_VERSION = "protocol version"  # in the FrameError for a frame of another v
 END = b"\x00"
 HEADER_BYTES = 4
 CRC_BYTES = 2
+LONGEST_BLOCK = 0xFF  # code byte of a block of 254 data bytes that is not followed by a zero
 LONGEST_FRAME = 64  # stuffed bytes without the final 0x00; INFO, the longest message, takes 34
 
 
@@ -39,7 +43,7 @@ class Envelope:
 def encode_frame(message: Message, sequence: int, flags: int = 0) -> bytes:
     """Return the bytes for the wire, including the final 0x00. `sequence` is taken modulo 256."""
     body = bytes((VERSION, message.TYPE, sequence & 0xFF, flags)) + message.pack()
-    return cobs.encode(body + crc16(body).to_bytes(CRC_BYTES, "little")) + END
+    return stuff(body + crc16(body).to_bytes(CRC_BYTES, "little")) + END
 
 
 def open_envelope(stuffed: bytes) -> Envelope:
@@ -48,7 +52,7 @@ def open_envelope(stuffed: bytes) -> Envelope:
     A cart needs them to refuse a frame with a reason. Raises FrameError for wrong stuffing, a frame that is
     cut short or a wrong checksum.
     """
-    data = cobs.decode(stuffed)
+    data = unstuff(stuffed)
     if len(data) < HEADER_BYTES + CRC_BYTES:
         raise FrameError(f"a frame of {len(data)} bytes is cut short")
     body, checksum = data[:-CRC_BYTES], int.from_bytes(data[-CRC_BYTES:], "little")
@@ -102,3 +106,37 @@ def crc16(data: bytes) -> int:
     Polynomial 0x1021, start 0xFFFF, not reflected, no final xor. Source: the CRC catalogue.
     """
     return binascii.crc_hqx(data, 0xFFFF)
+
+
+def stuff(data: bytes) -> bytes:
+    """Return `data` without zeros; it is one byte longer for data of up to 254 bytes."""
+    stuffed = bytearray()
+    parts = data.split(b"\x00")
+    for part in parts:
+        while len(part) >= LONGEST_BLOCK - 1:
+            stuffed.append(LONGEST_BLOCK)
+            stuffed += part[: LONGEST_BLOCK - 1]
+            part = part[LONGEST_BLOCK - 1 :]
+        stuffed.append(len(part) + 1)
+        stuffed += part
+    if parts[-1] and not part:  # a full block ends the data: no block after it
+        del stuffed[-1]
+    return bytes(stuffed)
+
+
+def unstuff(stuffed: bytes) -> bytes:
+    """Return the data that was encoded. Raises FrameError if a block is cut short or contains a zero."""
+    if not stuffed or 0 in stuffed:
+        raise FrameError("stuffed bytes are empty or contain a zero")
+    data = bytearray()
+    at = 0
+    while at < len(stuffed):
+        code = stuffed[at]
+        block = stuffed[at + 1 : at + code]
+        if len(block) != code - 1:
+            raise FrameError(f"block of {code - 1} bytes is cut short at {len(block)}")
+        data += block
+        at += code
+        if code != LONGEST_BLOCK and at < len(stuffed):
+            data.append(0)
+    return bytes(data)

@@ -14,7 +14,7 @@ class EmulateConfig(RigSettings):
 
 def emulate(config: EmulateConfig) -> None:
     """Run the cart; it prints one line of JSON when it is ready. Raises EmulatorError if it cannot run."""
-    from cartpole_rl.emulator.process import run  # imports MuJoCo
+    from cartpole_rl.emulator.device import run  # imports MuJoCo
 
     of_ip02 = config.hardware == nominal_hardware()
     if of_ip02 and parameters_of(config.cart) != parameters_of(choice("cart/ip02")):

@@ -19,8 +19,7 @@ from cartpole_rl.emulator.settings import ONBOARD
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.settings import CartPoleSettings
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.evaluation.episodes import Knocks, Policy, run_batch, run_episodes
-from cartpole_rl.evaluation.onboard import run_onboard_episodes
+from cartpole_rl.evaluation.episodes import Knocks, Policy, run_batch, run_episodes, run_onboard_episodes
 from cartpole_rl.evaluation.recordings import read_origin
 from cartpole_rl.evaluation.snapshots import followed
 from cartpole_rl.exporting.agent import ExportedAgent

@@ -17,7 +17,7 @@ from cartpole_rl.evaluation.driver import Driver, EpisodeRequest
 from cartpole_rl.evaluation.driving_policy import Weights
 from cartpole_rl.evaluation.recordings import LENGTH, read_recording, write_recording
 from cartpole_rl.learning.checkpoints import FINETUNING_FORMAT, TrainingCheckpoint, save_training
-from cartpole_rl.plants.serial.statistics import LinkStatistics
+from cartpole_rl.plants.serial.tracking import LinkStatistics
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
 from cartpole_rl.reporting.texts import ending_text, guard_text
 from cartpole_rl.run_folder import CHECKPOINTS, RECORDINGS, START

@@ -22,9 +22,8 @@ from cartpole_rl.evaluation.recordings import read_recording, write_recording
 from cartpole_rl.files import replacing, write_text
 from cartpole_rl.identification.checks import check_recordings, check_same_encoders, shared_period
 from cartpole_rl.identification.experiments import EXPERIMENTS, HELD_OUT, conduct, experiment_guard
-from cartpole_rl.identification.identify import Identification, identify
+from cartpole_rl.identification.identify import Identification, identify, intervals, no_force_up_to
 from cartpole_rl.identification.one_step import one_step_estimates
-from cartpole_rl.identification.quantities import intervals, no_force_up_to
 from cartpole_rl.identification.unknowns import WEIGHED
 from cartpole_rl.physics.laws import Law
 from cartpole_rl.physics.models import REGISTRIES, Models

@@ -15,7 +15,7 @@ import yaml
 from common import RUNS, failure, option_parser, print_table, read_json, write_json
 from truths import identification_truths, overrides, simulated_cart
 
-from cartpole_rl.identification.quantities import quantities
+from cartpole_rl.identification.identify import quantities
 
 TARGETS = {  # quantity: target of the median error, and whether errors are relative to the truth
     "pole_frequency": (0.01, True),

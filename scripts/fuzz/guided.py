@@ -37,7 +37,6 @@ with fuzzer.instrument_imports(include=LIBRARIES) if fuzzer else contextlib.null
     from cartpole_rl.plants.serial import cart as serial_cart
     from cartpole_rl.plants.serial import connection
     from cartpole_rl.plants.settings import SerialSettings
-    from cartpole_rl.wire import cobs
     from cartpole_rl.wire.frames import (
         END,
         LONGEST_FRAME,
@@ -46,6 +45,7 @@ with fuzzer.instrument_imports(include=LIBRARIES) if fuzzer else contextlib.null
         crc16,
         decode_frame,
         open_envelope,
+        stuff,
     )
     from cartpole_rl.wire.messages import FROM_CART, MESSAGES, Flags, SetMotor, Start, State
 
@@ -81,7 +81,7 @@ class Steps:
 def valid_frame(version: int, kind: int, sequence: int, flags: int, payload: bytes) -> bytes:
     """Return a frame with a right checksum, without its final 0x00."""
     body = bytes((version, kind, sequence, flags)) + payload
-    return cobs.encode(body + crc16(body).to_bytes(2, "little"))
+    return stuff(body + crc16(body).to_bytes(2, "little"))
 
 
 class Driven:

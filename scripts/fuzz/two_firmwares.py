@@ -31,8 +31,7 @@ from cartpole_rl.emulator import c_firmware
 from cartpole_rl.emulator.c_firmware import CFirmware
 from cartpole_rl.emulator.firmware import Firmware
 from cartpole_rl.rig.hardware import Hardware, hardware_of, nominal_hardware
-from cartpole_rl.wire import cobs
-from cartpole_rl.wire.frames import END, VERSION, FrameSplitter, crc16, encode_frame
+from cartpole_rl.wire.frames import END, VERSION, FrameSplitter, crc16, encode_frame, stuff
 from cartpole_rl.wire.messages import ClearFault, Hello, Home, Message, SetMotor, SetPeriod, Start, Stop
 
 SANITIZERS = ("-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
@@ -145,7 +144,7 @@ def any_frame(dice: random.Random, tick: int) -> bytes:
     if kind == SetPeriod.TYPE and length == 4:
         payload = dice.choice([dice.randint(4_000, 110_000), 20_000, 5_000, 5_001]).to_bytes(4, "little")
     body = bytes((version, kind, dice.randrange(256), dice.randrange(256))) + payload
-    return cobs.encode(body + crc16(body).to_bytes(2, "little")) + END
+    return stuff(body + crc16(body).to_bytes(2, "little")) + END
 
 
 def traffic(kind: str, pair: Pair, dice: random.Random, size: int) -> None:

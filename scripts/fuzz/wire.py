@@ -26,7 +26,6 @@ from collections.abc import Iterator
 
 from cartpole_rl.emulator.firmware import Firmware
 from cartpole_rl.errors import FrameError
-from cartpole_rl.wire import cobs
 from cartpole_rl.wire.frames import (
     END,
     LONGEST_FRAME,
@@ -35,6 +34,8 @@ from cartpole_rl.wire.frames import (
     decode_frame,
     encode_frame,
     open_envelope,
+    stuff,
+    unstuff,
 )
 from cartpole_rl.wire.messages import (
     Ack,
@@ -86,7 +87,7 @@ def damaged(count: int, whole: list[bytes], dice: random.Random) -> Iterator[byt
         stuffed = number % 2 == 0
         frame = bytearray(dice.choice(whole))
         if not stuffed:
-            frame = bytearray(cobs.decode(bytes(frame)))
+            frame = bytearray(unstuff(bytes(frame)))
         for _ in range(dice.randint(1, 4)):
             at, length = dice.randrange(len(frame) + 1), dice.randint(0, 3)
             new = (
@@ -95,7 +96,7 @@ def damaged(count: int, whole: list[bytes], dice: random.Random) -> Iterator[byt
                 else dice.randbytes(dice.randint(0, 3))
             )
             frame[at : at + length] = new
-        yield (bytes(frame) if stuffed else cobs.encode(bytes(frame))) + END
+        yield (bytes(frame) if stuffed else stuff(bytes(frame))) + END
 
 
 class Side:

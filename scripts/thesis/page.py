@@ -11,7 +11,6 @@ from charts import drawings, rank_agreements
 from results import Status, StudyResults
 from study import RUN
 
-from cartpole_rl.reporting.page import Html, document, escaped, table
 from cartpole_rl.reporting.results import (
     GOOD,
     Named,
@@ -32,6 +31,7 @@ from cartpole_rl.reporting.runs_page import (
     wide,
 )
 from cartpole_rl.reporting.statistics import Array, Estimate, bootstrap
+from cartpole_rl.reporting.style import Html, document, escaped, table
 from cartpole_rl.reporting.texts import count_text
 
 TITLE = "The thesis, carried out"

@@ -14,11 +14,11 @@ import torch
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, VectorEnv
 
+from cartpole_rl import ENVIRONMENTS, MAX_EPISODE_STEPS, register
 from cartpole_rl.choices import choice
 from cartpole_rl.envs.gymnasium import PERIOD, simulated_environment
 from cartpole_rl.envs.gymnasium_vector import CartPoleVector
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.registration import ENVIRONMENTS, MAX_EPISODE_STEPS, register
 
 STEPS, LIMIT = 130, 50
 ONE_COUNT = 0.01  # of an encoder, in an observation: where float32 rounds it otherwise

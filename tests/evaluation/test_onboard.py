@@ -10,9 +10,8 @@ from firmwares import needs_compiler
 
 from cartpole_rl.emulator.settings import ONBOARD
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.evaluation.episodes import run_episodes
+from cartpole_rl.evaluation.episodes import comparable, run_episodes, run_onboard_episodes
 from cartpole_rl.evaluation.metrics import same_as_host
-from cartpole_rl.evaluation.onboard import comparable, run_onboard_episodes
 from cartpole_rl.tasks.episode import Ending, Episode
 from cartpole_rl.workflows.build import (
     TrainedAgent,

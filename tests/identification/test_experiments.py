@@ -33,9 +33,8 @@ from cartpole_rl.identification.experiments import (
     run,
     track_end,
 )
-from cartpole_rl.identification.identify import Identification, identify, judged
+from cartpole_rl.identification.identify import Identification, identify, judged, quantities
 from cartpole_rl.identification.one_step import one_step_estimates
-from cartpole_rl.identification.quantities import quantities
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.serial.plant import emulated_plant

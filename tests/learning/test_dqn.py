@@ -20,7 +20,6 @@ from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import LearningError
 from cartpole_rl.learning.agent import QAgent
 from cartpole_rl.learning.dqn import COLLECTED, Scalars, Training, n_step_transitions
-from cartpole_rl.learning.finetuning import Finetuning
 from cartpole_rl.learning.retries import Retries
 from cartpole_rl.learning.settings import (
     BufferSettings,
@@ -33,6 +32,7 @@ from cartpole_rl.learning.settings import (
 from cartpole_rl.learning.states import seed_everything
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.tasks.settings import Measure, RewardSettings, Start, StartSettings
+from cartpole_rl.workflows.finetuning_learner import Finetuning
 
 LEARNING = choice("learning/fast") | {
     "transitions": 1024,

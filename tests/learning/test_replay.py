@@ -9,8 +9,8 @@ from tensordict import TensorDict
 from torchrl.data import TensorDictReplayBuffer
 
 from cartpole_rl.choices import choice
-from cartpole_rl.learning.replay import buffer_state, make_buffer, restore_buffer
 from cartpole_rl.learning.settings import BufferSettings
+from cartpole_rl.learning.states import buffer_state, make_buffer, restore_buffer
 
 KINDS = ("prioritized", "uniform")
 

@@ -14,7 +14,6 @@ from cartpole_rl.evaluation.episodes import run_episodes
 from cartpole_rl.evaluation.metrics import episode_metrics
 from cartpole_rl.evaluation.recordings import read_recording, write_recording
 from cartpole_rl.identification.experiments import recording
-from cartpole_rl.learning.finetuning import recorded_chunks
 from cartpole_rl.plants.measured import measured_part
 from cartpole_rl.plants.recorded import RecordedPlant
 from cartpole_rl.rig.hardware import nominal_encoders
@@ -22,6 +21,7 @@ from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.wire.messages import Fault
 from cartpole_rl.workflows.build import evaluated_env, evaluated_settings, trained_agent
 from cartpole_rl.workflows.config import EvaluateConfig, load_settings
+from cartpole_rl.workflows.finetuning_learner import recorded_chunks
 
 AGENT = "pretrained/medium"
 PERIOD = 0.02

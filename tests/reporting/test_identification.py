@@ -7,9 +7,8 @@ import pytest
 import torch
 
 from cartpole_rl.identification.fit import Fit
-from cartpole_rl.identification.identify import Candidate, Identification, PredictionError
+from cartpole_rl.identification.identify import Candidate, Identification, PredictionError, Quantity
 from cartpole_rl.identification.prediction import Replayed
-from cartpole_rl.identification.quantities import Quantity
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.physics.actuator import ACTUATORS
 from cartpole_rl.physics.friction import CART_FRICTIONS

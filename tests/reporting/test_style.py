@@ -10,7 +10,7 @@ import pytest
 
 from cartpole_rl.drawing.colours import BLUE
 from cartpole_rl.reporting import style
-from cartpole_rl.reporting.page import DARK, LIGHT
+from cartpole_rl.reporting.style import DARK, LIGHT
 
 
 def drawn(alt: str) -> str:

@@ -1,4 +1,7 @@
-"""Frames and messages: round trips, detection of damage, a splitter that stays synchronized and bounded."""
+"""Frames, messages and byte stuffing: round trips, detection of damage, published vectors.
+
+A splitter stays synchronized and bounded.
+"""
 
 from dataclasses import fields
 
@@ -7,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cartpole_rl.errors import FrameError
-from cartpole_rl.wire import cobs
 from cartpole_rl.wire.frames import (
     LONGEST_FRAME,
     Frame,
@@ -16,6 +18,8 @@ from cartpole_rl.wire.frames import (
     decode_frame,
     encode_frame,
     open_envelope,
+    stuff,
+    unstuff,
 )
 from cartpole_rl.wire.messages import MESSAGES, Hello, Message, MessageType, SetMotor, State
 
@@ -32,7 +36,7 @@ def messages() -> st.SearchStrategy[Message]:
 
 
 def frame_of(body: bytes) -> bytes:
-    return cobs.encode(body + crc16(body).to_bytes(2, "little"))
+    return stuff(body + crc16(body).to_bytes(2, "little"))
 
 
 @given(messages(), st.integers(0, 255), st.integers(0, 255))
@@ -57,10 +61,10 @@ def test_a_value_too_wide_for_its_field_is_refused():
 
 @given(messages(), st.data())
 def test_every_wrong_byte_is_detected(message, data):
-    body = bytearray(cobs.decode(encode_frame(message, 3)[:-1]))
+    body = bytearray(unstuff(encode_frame(message, 3)[:-1]))
     body[data.draw(st.integers(0, len(body) - 1))] ^= data.draw(st.integers(1, 255))
     with pytest.raises(FrameError):
-        decode_frame(cobs.encode(bytes(body)))
+        decode_frame(stuff(bytes(body)))
 
 
 @pytest.mark.parametrize(
@@ -118,3 +122,48 @@ def test_splitter_skips_empty_runs_and_stays_bounded():
     assert len(splitter.pending) <= LONGEST_FRAME
     assert splitter.overlong == 1
     assert list(splitter.feed(b"\x00" + encode_frame(Hello(), 0))) == [encode_frame(Hello(), 0)[:-1]]
+
+
+def span(first: int, last: int) -> bytes:
+    return bytes(range(first, last + 1))
+
+
+VECTORS = [  # from Cheshire and Baker's paper and the list that implementations commonly share
+    (b"", b"\x01"),
+    (b"\x00", b"\x01\x01"),
+    (b"\x00\x00", b"\x01\x01\x01"),
+    (b"\x00\x11\x00", b"\x01\x02\x11\x01"),
+    (b"\x11\x22\x00\x33", b"\x03\x11\x22\x02\x33"),
+    (b"\x11\x22\x33\x44", b"\x05\x11\x22\x33\x44"),
+    (b"\x11\x00\x00\x00", b"\x02\x11\x01\x01\x01"),
+    (span(1, 254), b"\xff" + span(1, 254)),
+    (b"\x00" + span(1, 254), b"\x01\xff" + span(1, 254)),
+    (span(1, 255), b"\xff" + span(1, 254) + b"\x02\xff"),
+    (span(2, 255) + b"\x00", b"\xff" + span(2, 255) + b"\x01\x01"),
+    (span(3, 255) + b"\x00\x01", b"\xfe" + span(3, 255) + b"\x02\x01"),
+]
+
+
+@pytest.mark.parametrize(("data", "stuffed"), VECTORS)
+def test_published_vectors_both_ways(data, stuffed):
+    assert stuff(data) == stuffed
+    assert unstuff(stuffed) == data
+
+
+@given(st.binary(max_size=800) | st.integers(0, 800).map(lambda length: b"\x07" * length))
+def test_round_trip_has_no_zero_and_bounded_overhead(data):
+    stuffed = stuff(data)
+    assert 0 not in stuffed
+    assert len(stuffed) <= len(data) + 1 + len(data) // 254
+    assert unstuff(stuffed) == data
+
+
+@pytest.mark.parametrize("stuffed", [b"", b"\x05\x11", b"\x02", b"\x02\x00", b"\xff\x01"])
+def test_bytes_that_no_encoder_makes_are_refused(stuffed):
+    with pytest.raises(FrameError):
+        unstuff(stuffed)
+
+
+def test_checksum_of_the_catalogue():
+    assert crc16(b"123456789") == 0x29B1
+    assert crc16(b"") == 0xFFFF

@@ -22,7 +22,7 @@ from cartpole_rl.files import write_bytes
 from cartpole_rl.learning.checkpoints import FINETUNING_FORMAT, AgentCheckpoint, load_training, save_agent
 from cartpole_rl.learning.settings import FinetuningSettings, LearningSettings
 from cartpole_rl.learning.states import seed_everything
-from cartpole_rl.plants.serial.statistics import LinkStatistics
+from cartpole_rl.plants.serial.tracking import LinkStatistics
 from cartpole_rl.reporting.tensorboard import TensorBoardLog, scalars
 from cartpole_rl.run_folder import file_hash, recorded_provenance, write_config
 from cartpole_rl.tasks.episode import Episode

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from cartpole_rl.plants.serial.statistics import LinkStatistics
+from cartpole_rl.plants.serial.tracking import LinkStatistics
 from cartpole_rl.plants.settings import SerialSettings
 from cartpole_rl.run_folder import write_config
 from cartpole_rl.terminal import print_loop_time

@@ -8,14 +8,13 @@ import os
 import sys
 
 from cartpole_rl.emulator.link import Channel, open_link
-from cartpole_rl.emulator.process import until_stopped
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import CartPoleError
 from cartpole_rl.plants.drivers.bridge import Bridge
 from cartpole_rl.plants.settings import BOARDS
 from cartpole_rl.rig.hardware import Hardware
 from cartpole_rl.scheduling import take_precedence
-from cartpole_rl.signals import end_with_parent, starting_process
+from cartpole_rl.signals import end_with_parent, starting_process, until_stopped
 
 
 def main(text: str) -> int:

@@ -15,8 +15,7 @@ from cartpole_rl.plants.serial.connection import WATCHDOG_PERIODS, Connection
 from cartpole_rl.plants.serial.errors import RefusedError, check_limits, check_rig, fault_error
 from cartpole_rl.plants.serial.link import SerialLink, now
 from cartpole_rl.plants.serial.port import UsbPort, found_ports, open_port, port_of, resolved_port
-from cartpole_rl.plants.serial.statistics import LinkStatistics
-from cartpole_rl.plants.serial.tracking import StateTracker
+from cartpole_rl.plants.serial.tracking import LinkStatistics, StateTracker
 from cartpole_rl.plants.settings import SerialSettings
 from cartpole_rl.rig.hardware import Hardware, nominal_hardware
 from cartpole_rl.terminal import waiting

@@ -11,7 +11,7 @@ import serial
 
 from cartpole_rl.errors import FrameError, LinkError
 from cartpole_rl.plants.serial.port import set_exclusive
-from cartpole_rl.plants.serial.statistics import LinkStatistics
+from cartpole_rl.plants.serial.tracking import LinkStatistics
 from cartpole_rl.wire.frames import Frame, FrameSplitter, decode_frame, encode_frame
 from cartpole_rl.wire.messages import Message
 

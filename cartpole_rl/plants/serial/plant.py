@@ -28,7 +28,7 @@ from cartpole_rl.plants.serial.preparation import (
     asking,
     nobody,
 )
-from cartpole_rl.plants.serial.statistics import LinkStatistics
+from cartpole_rl.plants.serial.tracking import LinkStatistics
 from cartpole_rl.plants.settings import BoardSettings, EmulatedSettings, Rehome, SerialSettings
 from cartpole_rl.plants.specs import TERMINATING, TRUNCATING, Numbers, OneCartPlant, PlantOutput, on_tensors
 from cartpole_rl.rig.hardware import Hardware, hardware_of

@@ -12,13 +12,13 @@ import pytest
 from cartpole_rl.choices import choice
 from cartpole_rl.emulator.guards import LEVER, TrackLimits, lever_um
 from cartpole_rl.emulator.homing import HomingError, Reading
-from cartpole_rl.emulator.process import until_stopped
 from cartpole_rl.errors import ConfigError, LinkError
 from cartpole_rl.plants.drivers.bridge import CONFIRMED, STOPS, Bridge, MotorCommands, StandIn
 from cartpole_rl.plants.drivers.driver import Driver, Measurement
 from cartpole_rl.plants.settings import DriverSettings
 from cartpole_rl.rig.hardware import Encoders, hardware_of
 from cartpole_rl.rig.parameters import completed
+from cartpole_rl.signals import until_stopped
 from cartpole_rl.wire.messages import Fault
 
 RIG = hardware_of(choice("cart/stepper"))  # 25 um, 4096 counts a turn

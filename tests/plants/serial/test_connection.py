@@ -13,8 +13,7 @@ from cartpole_rl.plants.serial import connection
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.errors import RefusedError
 from cartpole_rl.plants.serial.link import SerialLink
-from cartpole_rl.wire import cobs
-from cartpole_rl.wire.frames import END, Frame, crc16
+from cartpole_rl.wire.frames import END, Frame, crc16, stuff, unstuff
 from cartpole_rl.wire.messages import (
     Ack,
     Fault,
@@ -90,8 +89,8 @@ def test_a_host_begins_with_any_sequence() -> None:
 def frames_of_version(version: int, frames: Iterable[bytes]) -> Iterator[bytes]:
     """The frames as a cart of another protocol version sends them."""
     for frame in frames:
-        body = bytes([version]) + cobs.decode(frame[:-1])[1:-2]
-        yield cobs.encode(body + crc16(body).to_bytes(2, "little")) + END
+        body = bytes([version]) + unstuff(frame[:-1])[1:-2]
+        yield stuff(body + crc16(body).to_bytes(2, "little")) + END
 
 
 class OldCart(CartPeer):

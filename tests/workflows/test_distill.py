@@ -9,11 +9,10 @@ import torch
 from cartpole_rl.envs.build import simulated_env
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy
 from cartpole_rl.learning.agent import QAgent
-from cartpole_rl.learning.distillation import Distillation
 from cartpole_rl.learning.settings import DistillationSettings
 from cartpole_rl.workflows.build import TrainedAgent, new_agent, trained_agent
 from cartpole_rl.workflows.config import DistillConfig, TrainConfig, load_settings
-from cartpole_rl.workflows.distill import student_settings
+from cartpole_rl.workflows.distill import Distillation, student_settings
 
 SMALL = DistillationSettings(
     carts=32,

@@ -17,7 +17,6 @@ from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.learning.agent import QAgent
-from cartpole_rl.learning.finetuning import Finetuning, recorded_chunks
 from cartpole_rl.learning.settings import (
     BufferSettings,
     FinetuningSettings,
@@ -27,6 +26,7 @@ from cartpole_rl.learning.settings import (
 from cartpole_rl.plants.specs import Plant
 from cartpole_rl.rig.hardware import hardware_of
 from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.workflows.finetuning_learner import Finetuning, recorded_chunks
 
 Over = Callable[..., CartPoleEnv]
 MOTORS = (-250, -200, 0, 200, 250)
