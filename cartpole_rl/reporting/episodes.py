@@ -1,7 +1,7 @@
-"""Results of episodes: metrics.json, and angle, position and motor value of one episode over time.
+"""Results of episodes: metrics.json, the learning curve, and one episode over time.
 
-Figures 6.2 and 6.10 of the thesis scale the three to one axis; here each has a panel with its unit, on a
-common time axis.
+The learning curve is figure 6.9 of the thesis. Its figures 6.2 and 6.10 scale angle, position and motor value
+to one axis; here each has a panel with its unit, on a common time axis.
 """
 
 import math
@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from cartpole_rl.drawing import colours
@@ -20,15 +21,15 @@ from cartpole_rl.evaluation.recordings import stored_origins
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.reporting import style
 from cartpole_rl.reporting.animation import durations, frames, write_animation
-from cartpole_rl.reporting.scores import learning_curve
-from cartpole_rl.reporting.texts import ending_text, guard_text
+from cartpole_rl.reporting.texts import SCORES, ending_text, guard_text
 from cartpole_rl.rig.hardware import LARGEST_MOTOR
 from cartpole_rl.run_folder import ANIMATION, FIGURES, METRICS, write_json
 from cartpole_rl.tasks.episode import Episode, is_upright, upright_since
 from cartpole_rl.tasks.rewards import UPRIGHT_ANGLE
-from cartpole_rl.tasks.settings import TaskSettings
+from cartpole_rl.tasks.settings import Measure, TaskSettings
 
 SMALL_SWING = 40.0  # deg; the angle axis of an episode within it is enlarged
+MILLION = 1e6
 MOTOR_TICKS = (-250, -125, 0, 125, 250)
 
 Array = NDArray[np.float64]
@@ -90,6 +91,29 @@ def draw(
     style.save(behaviour(episode, f"First episode, {title}", x_max), folder / f"{prefix}behaviour.png")
     pictures = [*frames(episode, pole.nominal.length, x_max, title)]
     write_animation(folder / f"{prefix}{ANIMATION}", pictures, durations(episode), mp4)
+
+
+def learning_curve(history: Sequence[Mapping[str, Any]], measure: Measure) -> Figure:
+    """Draw the mean of each evaluation over millions of transitions, in a band from worst to best episode.
+
+    Each record of `history`, one or more, has `transitions`, and over the episodes of that evaluation the
+    `measure` (mean), `score_min` and `score_max`.
+    """
+    figure = style.new_figure(height=4.4)
+    axes = figure.subplots()
+    style.dress(axes, x="transitions (millions)", y=f"{SCORES[measure]} of an episode")
+    keys = ("transitions", measure, "score_min", "score_max")
+    transitions, means, lowest, highest = np.array([[each[key] for key in keys] for each in history], float).T
+    millions, colour = transitions / MILLION, style.series_colour(0)
+    axes.fill_between(millions, lowest, highest, color=colour, alpha=0.13, linewidth=0)
+    marker = "o" if len(millions) == 1 else ""
+    axes.plot(millions, means, marker=marker, color=colour, linewidth=2.2, label=measure)
+    axes.xaxis.set_major_locator(MaxNLocator(nbins=8, steps=(1, 2, 5, 10)))
+    axes.set_xlim(left=0)
+    axes.set_ylim(bottom=min(0.0, axes.dataLim.y0))
+    axes.legend(loc="lower right", fontsize=style.SMALL_SIZE, frameon=True, framealpha=0.9, edgecolor="none")
+    style.title(axes, "Learning curve", "line: mean,  band: worst to best episode")
+    return figure
 
 
 def behaviour(episode: Episode, title: str = "One episode", track_half_length: float | None = None) -> Figure:

@@ -27,9 +27,8 @@ from cartpole_rl.reporting.runs import (
     run_of,
     short,
 )
-from cartpole_rl.reporting.scores import SCORES
 from cartpole_rl.reporting.statistics import interquartile_mean
-from cartpole_rl.reporting.texts import count_text
+from cartpole_rl.reporting.texts import SCORES, count_text
 from cartpole_rl.run_folder import BASELINE, CART, COMPARISON, POLE, PREFIX, PRETRAINED, RANDOMIZATION, USES
 
 MOST_MEASURES = 20  # in a message

@@ -1,7 +1,8 @@
-"""Texts that figures, tables and messages share, and small text tables for terminals."""
+"""Texts that figures, tables and messages share, and text tables for terminals."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 from cartpole_rl.tasks.episode import Ending, Episode
 
@@ -14,6 +15,16 @@ ENDINGS = {
     Ending.FAULT: "the cart reported a fault",
     Ending.LINK: "the link was lost",
     Ending.NON_FINITE: "a value was not finite",
+}
+SCORES = {  # key in metrics.json: label
+    "score": "score (6.2)",
+    "score_upright": "score upright (6.1)",
+    "time_to_upright_s": "time to upright, s",
+    "upright_fraction": "share of time upright",
+    "rms_angle_rad": "RMS angle while upright, rad",
+    "rms_position_m": "RMS position while upright, m",
+    "min_track_margin_m": "nearest to the track's end, m",
+    "guarded_fraction": "share of time under the track guard",  # None without a guard
 }
 MISSING = "–"
 GAP = "  "
@@ -35,6 +46,27 @@ def table(rows: Sequence[Mapping[str, Cell]], columns: Mapping[str, str] | Seque
     return "\n".join(GAP.join(line).rstrip() for line in zip(*cells, strict=True))
 
 
+def score_table(summary: Mapping[str, Any], heading: str) -> str:
+    """Return a table of the means in a summary of episodes (`evaluation.metrics.summarize`)."""
+    return score_columns({"mean": summary}, heading)
+
+
+def score_columns(summaries: Mapping[str, Mapping[str, Any]], heading: str) -> str:
+    """Return a table with a column of means for each summary, by its name.
+
+    The intervals of a row have one form: by their ends if one of them is asymmetric.
+    """
+    rows = []
+    for key, label in SCORES.items():
+        means = {name: summary[key] for name, summary in summaries.items()}
+        if any(mean is not None for mean in means.values()):
+            texts = {name: mean_text(mean) for name, mean in means.items()}
+            if any(" to " in (text or "") for text in texts.values()):
+                texts = {name: mean_text(mean, ends=True) for name, mean in means.items()}
+            rows.append({"figure": label, **texts})
+    return table(rows, {"figure": heading, **{name: name for name in summaries}})
+
+
 def interval_text(
     mean: float, low: float | None, high: float | None, ends: bool = False, most_decimals: int = MOST_DECIMALS
 ) -> str:
@@ -52,6 +84,11 @@ def interval_text(
     if not ends and abs(below - above) <= ASYMMETRY * max(below, above):
         return f"{mean:z.{decimals}f} ± {(below + above) / 2:z.{decimals}f}"
     return f"{mean:z.{decimals}f} ({low:z.{decimals}f} to {high:z.{decimals}f})"
+
+
+def mean_text(value: Mapping[str, Any] | None, ends: bool = False) -> str | None:
+    """Return a mean with its interval, by its `ends` or as `interval_text` chooses; None without one."""
+    return None if value is None else interval_text(value["mean"], value["low"], value["high"], ends)
 
 
 def number_text(value: float, most_decimals: int = MOST_DECIMALS) -> str:

@@ -9,8 +9,7 @@ from cartpole_rl.evaluation.episodes import Policy, run_batch
 from cartpole_rl.evaluation.metrics import same_as_host
 from cartpole_rl.reporting.animation import side_by_side, write_animation
 from cartpole_rl.reporting.episodes import report_episodes, summarized
-from cartpole_rl.reporting.scores import score_columns, score_table
-from cartpole_rl.reporting.texts import count_text, cut_off
+from cartpole_rl.reporting.texts import count_text, cut_off, score_columns, score_table
 from cartpole_rl.rig.hardware import nominal_hardware
 from cartpole_rl.rig.parameters import PARAMETERS
 from cartpole_rl.run_folder import (

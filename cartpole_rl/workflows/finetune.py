@@ -37,9 +37,8 @@ from cartpole_rl.learning.settings import RayLearnerSettings
 from cartpole_rl.learning.states import seed_everything
 from cartpole_rl.plants.serial.preparation import Confirm
 from cartpole_rl.reporting.episodes import report_episodes, summarized
-from cartpole_rl.reporting.scores import SCORES, score_table
 from cartpole_rl.reporting.tensorboard import TensorBoardLog
-from cartpole_rl.reporting.texts import count_text, cut_off
+from cartpole_rl.reporting.texts import SCORES, count_text, cut_off, score_table
 from cartpole_rl.reporting.web_view import chosen_view
 from cartpole_rl.run_folder import (
     AGENT_HASH,

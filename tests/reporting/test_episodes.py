@@ -1,4 +1,4 @@
-"""The figure of an episode shows it in the units that its axes name."""
+"""The figure of an episode shows it in the units that its axes name; a learning curve has mean and band."""
 
 import dataclasses
 import math
@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from matplotlib.patches import StepPatch
 
 from cartpole_rl.drawing import colours
-from cartpole_rl.reporting.episodes import behaviour, wrapped_line
+from cartpole_rl.reporting.episodes import behaviour, learning_curve, wrapped_line
+from cartpole_rl.reporting.style import series_colour
 from cartpole_rl.tasks.episode import Episode
 
 TRACK = 0.407  # m
@@ -70,3 +71,27 @@ def test_a_wrapped_line_never_jumps(steps: list[float], start: float, wrapped: b
     longest = np.degrees(np.abs(np.diff(theta)).max())
     assert np.all(drawn[np.isfinite(drawn)] <= longest + 1e-6)
     assert np.all(np.diff(times) >= -1e-12)
+
+
+def records(scores: list[float], transitions_apart: int = 100_000) -> list[dict]:
+    """Evaluations a second apart whose episodes lie 100 around the mean."""
+    return [
+        {
+            "transitions": (i + 1) * transitions_apart,
+            "seconds": float(i + 1),
+            "score": score,
+            "score_min": score - 100,
+            "score_max": score + 100,
+        }
+        for i, score in enumerate(scores)
+    ]
+
+
+def test_one_run_is_a_line_over_millions_of_transitions_in_its_band() -> None:
+    axes = learning_curve(records([100, 900, 4100]), "score").axes[0]
+    np.testing.assert_allclose(line_of(axes, series_colour(0)), [[0.1, 100], [0.2, 900], [0.3, 4100]])
+    band = axes.collections[0].get_paths()[0].vertices
+    assert band[:, 1].min() == 0
+    assert band[:, 1].max() == 4200
+    assert axes.get_xlabel() == "transitions (millions)"
+    assert axes.get_ylabel() == "score (6.2) of an episode"

@@ -6,7 +6,7 @@ import pytest
 
 from cartpole_rl.reporting.results import estimate_text, value_text
 from cartpole_rl.reporting.statistics import Estimate
-from cartpole_rl.reporting.texts import interval_text, number_text, table
+from cartpole_rl.reporting.texts import SCORES, interval_text, number_text, score_columns, table
 
 
 def test_layout_of_a_table() -> None:
@@ -68,3 +68,12 @@ def test_an_interval_is_written_by_its_ends(found: Estimate, measure: str, text:
 @pytest.mark.parametrize(("value", "text"), [(4210.4, "4210"), (2.76, "2.8"), (-0.000019, "0.0")])
 def test_a_score_has_at_most_one_decimal_and_no_minus_zero(value: float, text: str) -> None:
     assert value_text(value, "score") == text
+
+
+def test_the_intervals_of_a_row_have_one_form() -> None:
+    def summary(low: float) -> dict:
+        return {**dict.fromkeys(SCORES), "score": {"mean": 4000.0, "low": low, "high": 4100.0}}
+
+    assert "4000 ± 100" in score_columns({"mean": summary(3900.0)}, "")
+    row = score_columns({"here": summary(3900.0), "there": summary(3500.0)}, "").splitlines()[-1]
+    assert "4000 (3900 to 4100)  4000 (3500 to 4100)" in row
