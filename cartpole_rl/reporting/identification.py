@@ -28,7 +28,7 @@ from cartpole_rl.physics.friction import viscous_coefficient
 from cartpole_rl.physics.laws import Law
 from cartpole_rl.physics.parameters import CartParameters, cart_column
 from cartpole_rl.reporting import style, texts
-from cartpole_rl.reporting.episodes import wrapped_line
+from cartpole_rl.reporting.predictions import draw_angle, draw_position
 from cartpole_rl.reporting.style import document, escaped, table
 from cartpole_rl.reporting.texts import interval_text, number_text
 from cartpole_rl.rig.hardware import LARGEST_MOTOR
@@ -47,7 +47,7 @@ CAPTIONS = {  # figures/<name>.png: caption
 }
 FASTEST = 0.6  # m/s
 MOST_SAMPLES = 500  # carts in a band
-IDENTIFIED, PRIOR, SIMULATED = colours.BLUE, colours.MUTED, colours.VERMILLION
+IDENTIFIED, PRIOR = colours.BLUE, colours.MUTED
 TAIL = 2.5  # percent beyond each end of an interval
 MOST_DRAWN = 12  # recordings
 BINS, FEWEST = 25, 10  # of a figure's axis; samples in one that is drawn
@@ -63,11 +63,7 @@ Parameters = Mapping[str, float]
 
 def quantities_table(quantities: Sequence[Quantity]) -> str:
     """Return the identified quantities as a table for the terminal."""
-    rows = [
-        {"name": each.words, "value": interval_text(each.value, each.low, each.high), "unit": each.unit}
-        for each in quantities
-    ]
-    return texts.table(rows, {"name": "quantity", "value": "value, 95 % interval", "unit": "unit"})
+    return texts.table(_quantity_rows(quantities), ("quantity", "value, 95 % interval", "unit"))
 
 
 def error_text(error: PredictionError) -> str:
@@ -137,8 +133,9 @@ def _quantity_rows(quantities: Sequence[Quantity]) -> list[dict[str, str]]:
     return [
         {
             "quantity": each.words,
-            "identified, 95 % interval": f"{interval_text(each.value, each.low, each.high)} {each.unit}",
-            "prior": f"{number_text(each.prior)} {each.unit}",
+            "value, 95 % interval": interval_text(each.value, each.low, each.high),
+            "prior": number_text(each.prior),
+            "unit": each.unit,
         }
         for each in quantities
     ]
@@ -258,8 +255,8 @@ def experiments_figure(replays: Mapping[str, Replayed]) -> Figure:
     figure = style.new_figure(height=1.0 + 2.1 * len(replays), width=10.0)
     panels = figure.subplots(len(replays), 2, squeeze=False)
     for (left, right), (name, replayed) in zip(panels, replays.items(), strict=True):
-        _draw_positions(left, replayed)
-        _draw_angles(right, replayed)
+        draw_position(left, replayed)
+        draw_angle(right, replayed, hanging=True)
         start = _liveliest(replayed.episode)
         for axes in (left, right):
             axes.set_xlim(start, min(start + LONGEST, float(replayed.episode.time[-1])))
@@ -333,27 +330,6 @@ def _liveliest(episode: Episode) -> float:
     starts = episode.time[episode.time <= max(episode.time[0], episode.time[-1] - LONGEST)]
     covered = np.interp(starts + LONGEST, episode.time, way) - np.interp(starts, episode.time, way)
     return float(starts[int(np.argmax(covered))])
-
-
-def _draw_positions(axes: Axes, replayed: Replayed) -> None:
-    style.dress(axes, y="cart (cm)")
-    episode = replayed.episode
-    axes.plot(episode.time, 100 * episode.x, color=colours.CART, linewidth=3, alpha=0.55, label="measured")
-    for times, positions in zip(replayed.time, replayed.x, strict=True):
-        known = np.isfinite(positions)
-        axes.plot(times[known], 100 * positions[known], color=SIMULATED, linewidth=1.1)
-
-
-def _draw_angles(axes: Axes, replayed: Replayed) -> None:
-    style.dress(axes, y="from hanging (deg)")
-    measured = wrapped_line(replayed.episode.time, replayed.episode.theta - np.pi)
-    axes.plot(*measured, color=colours.POLE, linewidth=3, alpha=0.45, label="measured")
-    for index, (times, angles) in enumerate(zip(replayed.time, replayed.theta, strict=True)):
-        known = np.isfinite(angles)
-        line = wrapped_line(times[known], angles[known] - np.pi)
-        axes.plot(*line, color=SIMULATED, linewidth=1.1, label="simulated" if index == 0 else None)
-    axes.set_yticks((-180, -90, 0, 90, 180))
-    axes.set_ylim(-190, 190)
 
 
 def spectrum_figure(covariance: Array, names: Sequence[str]) -> Figure:

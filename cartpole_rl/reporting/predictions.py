@@ -36,21 +36,20 @@ Array = NDArray[np.float64]
 Errors = Sequence[Mapping[str, Any]]  # one mapping for each time after a reset: `prediction.errors_at`
 
 
-def replay_table(errors: Errors, heading: str) -> str:
-    """Return the errors of a replay as a table below `heading`."""
-    rows = [{"time": f"{line['after_s']:g}", **_error_cells(line)} for line in errors]
-    return f"{heading}\n{table(rows, {'time': 'time (s)', **ERROR_COLUMNS})}"
-
-
-def model_table(errors: Mapping[str, Errors], heading: str) -> str:
-    """Return the errors of several models at the same times as a table below `heading`."""
+def error_table(errors: Mapping[str, Errors], heading: str) -> str:
+    """Return the errors of models at the same times as a table below `heading`; one model is not named."""
     first = next(iter(errors))
     rows = [
-        {"time": f"{line['after_s']:g}" if model == first else "", "model": model, **_error_cells(line)}
+        {
+            "time": f"{line['after_s']:g}" if model == first else "",
+            "model": model,
+            **{key: number_text(line[key]) for key in ERROR_COLUMNS},
+        }
         for lines in zip(*errors.values(), strict=True)
         for model, line in zip(errors, lines, strict=True)
     ]
-    return f"{heading}\n{table(rows, {'time': 'time (s)', 'model': 'model', **ERROR_COLUMNS})}"
+    models = {"model": "model"} if len(errors) > 1 else {}
+    return f"{heading}\n{table(rows, {'time': 'time (s)', **models, **ERROR_COLUMNS})}"
 
 
 def spread_table(errors: Errors, spreads: float, heading: str) -> str:
@@ -65,10 +64,6 @@ def spread_table(errors: Errors, spreads: float, heading: str) -> str:
     return f"{heading}\n{table(rows, columns)}"
 
 
-def _error_cells(line: Mapping[str, Any]) -> dict[str, str]:
-    return {key: number_text(line[key]) for key in ERROR_COLUMNS}
-
-
 def replay_figure(
     replays: Sequence[Replayed], period: float, times: Sequence[float], title: str, subtitle: str
 ) -> Figure:
@@ -80,9 +75,18 @@ def replay_figure(
     figure = style.new_figure(height=8.2)
     above, below = figure.subfigures(2, 1, hspace=0.05, height_ratios=(1.75, 1.0), squeeze=False)[:, 0]
     angle, position = above.subplots(2, 1, sharex=True, height_ratios=(1.5, 1.0))
-    _draw_angle(angle, replays[0])
-    _draw_position(position, replays[0])
+    draw_angle(angle, replays[0])
+    draw_position(position, replays[0])
+    first = replays[0].episode
+    angle.set_xlim(first.time[0], first.time[-1])
+    style.beside(angle, 0, "upright", colours.MUTED)
+    style.beside(angle, 180, "hanging", colours.MUTED)
     style.title(angle, title, subtitle)
+    style.label(position, x="time (s)")
+    reach = 1.2 * max(2.0, 100 * float(np.abs(first.x).max()))
+    position.set_ylim(-reach, 1.5 * reach)
+    looks: dict[str, Any] = {"frameon": True, "framealpha": 0.9, "edgecolor": "none"}
+    position.legend(loc="upper right", ncols=2, fontsize=style.SMALL_SIZE, **looks)
     above.align_ylabels()
     errors = all_errors(replays)
     lag = period * np.arange(len(errors), dtype=np.float64)
@@ -100,33 +104,33 @@ def replay_figure(
     return figure
 
 
-def _draw_angle(axes: Axes, replay: Replayed) -> None:
-    style.dress(axes, y="pole angle (deg)")
-    episode = replay.episode
-    axes.plot(*wrapped_line(episode.time, episode.theta), color=colours.POLE, linewidth=3.2, alpha=0.45)
-    for times, angles in zip(replay.time, replay.theta, strict=True):
+def draw_angle(axes: Axes, replay: Replayed, hanging: bool = False) -> None:
+    """Draw the measured and the simulated angle (deg) over time (s), from upright or from `hanging`."""
+    style.dress(axes, y="from hanging (deg)" if hanging else "pole angle (deg)")
+    episode, zero = replay.episode, np.pi if hanging else 0.0
+    line = wrapped_line(episode.time, episode.theta - zero)
+    axes.plot(*line, color=colours.POLE, linewidth=3, alpha=0.45, label="measured")
+    for stretch, (times, angles) in enumerate(zip(replay.time, replay.theta - zero, strict=True)):
         known = np.isfinite(angles)
-        axes.plot(*wrapped_line(times[known], angles[known]), color=SIMULATED, linewidth=1.2)
-        axes.plot(times[0], wrapped_line(times[:1], angles[:1])[1], "o", color=SIMULATED, markersize=3.5)
+        _draw_stretch(axes, *wrapped_line(times[known], angles[known]), named=stretch == 0)
     axes.set_ylim(-190, 190)
     axes.set_yticks((-180, -90, 0, 90, 180))
-    axes.set_xlim(episode.time[0], episode.time[-1])
-    style.beside(axes, 0, "upright", colours.MUTED)
-    style.beside(axes, 180, "hanging", colours.MUTED)
 
 
-def _draw_position(axes: Axes, replay: Replayed) -> None:
-    style.dress(axes, x="time (s)", y="cart (cm)")
+def draw_position(axes: Axes, replay: Replayed) -> None:
+    """Draw the measured and the simulated position (cm) over time (s)."""
+    style.dress(axes, y="cart (cm)")
     episode = replay.episode
-    axes.plot(episode.time, 100 * episode.x, color=colours.CART, linewidth=3.2, alpha=0.55, label="measured")
+    axes.plot(episode.time, 100 * episode.x, color=colours.CART, linewidth=3, alpha=0.55, label="measured")
     for stretch, (times, positions) in enumerate(zip(replay.time, replay.x, strict=True)):
-        name = "simulated, reset at each dot" if stretch == 0 else None
-        axes.plot(times, 100 * positions, color=SIMULATED, linewidth=1.2, label=name)
-        axes.plot(times[0], 100 * positions[0], "o", color=SIMULATED, markersize=3.5)
-    reach = 1.2 * max(2.0, 100 * float(np.abs(episode.x).max()))
-    axes.set_ylim(-reach, 1.5 * reach)
-    looks: dict[str, Any] = {"frameon": True, "framealpha": 0.9, "edgecolor": "none"}
-    axes.legend(loc="upper right", ncols=2, fontsize=style.SMALL_SIZE, **looks)
+        _draw_stretch(axes, times, 100 * positions, named=stretch == 0)
+
+
+def _draw_stretch(axes: Axes, times: Array, values: Array, named: bool) -> None:
+    """Draw what is simulated from a reset on, which is a dot."""
+    name = "simulated, reset at each dot" if named else None
+    axes.plot(times, values, color=SIMULATED, linewidth=1.2, label=name)
+    axes.plot(times[:1], values[:1], "o", color=SIMULATED, markersize=3.5)
 
 
 def _draw_errors(axes: Axes, lag: Array, errors: Array, colour: str) -> None:
@@ -161,38 +165,17 @@ def _mark_times(axes: Axes, lag: Array, errors: Array, times: Sequence[float], u
 
 
 def ensemble_figure(physics: Prediction, learned: Prediction, ensemble: Ensemble, subtitle: str) -> Figure:
-    """Draw predictions by physics alone and by the ensemble, and what the ensemble has learned."""
-    visited = ensemble.positions[:, 0].flatten().numpy()
-    return learned_model_figure(
-        ensemble.dynamics.period,
-        physics,
-        learned,
-        *forces_along_track(ensemble.best.as_float(), visited),
-        np.array(ensemble.updates, dtype=np.float64),
-        np.array(ensemble.history),
-        subtitle=subtitle,
-    )
+    """Draw prediction errors above the force that the ensemble has learned, and the loss.
 
-
-def learned_model_figure(
-    period: float,
-    physics: Prediction,
-    learned: Prediction,
-    places: Array,
-    forces: Array,
-    updates: Array,
-    losses: Array,
-    subtitle: str = "",
-) -> Figure:
-    """Draw prediction errors above the learned force and the loss.
-
-    Above: RMS errors of cart (mm) and angle (deg) over the time predicted, and the spread of the ensemble.
-    Below: the `forces` [M, K] N of the members at `places` [K] m of the track, NaN for places that were never
-    visited, and the validation `losses` [R, M] after `updates` [R]. Thin lines are members, thick lines their
-    mean. `period` is the control period, s.
+    Above: RMS errors of cart (mm) and angle (deg) over the time predicted, by physics alone and with the
+    ensemble, and its spread. Below: the force of the members over the places that were visited, and the
+    validation loss over the updates. Thin lines are members, thick lines their mean.
     """
+    visited = ensemble.positions[:, 0].flatten().numpy()
+    places, forces = forces_along_track(ensemble.best.as_float(), visited)
+    updates, losses = np.array(ensemble.updates, dtype=np.float64), np.array(ensemble.history)
     figure = style.new_figure(height=6.6)
-    time = period * np.arange(len(physics.error), dtype=np.float64)
+    time = ensemble.dynamics.period * np.arange(len(physics.error), dtype=np.float64)
     (cart, angle), (track, learning) = figure.subplots(2, 2)
     for axes, channel, factor in ((cart, 0, 1e3), (angle, 1, 180 / np.pi)):
         for each, (name, colour, dashes, width) in zip(
@@ -205,9 +188,9 @@ def learned_model_figure(
     style.label(angle, x="prediction time (s)", y="RMS error, angle (deg)")
     cart.legend(loc="lower right", fontsize=style.SMALL_SIZE, frameon=False)
     _draw_members(track, 100 * places, forces.T, "position on the track (cm)", "learned force (N)")
-    visited = places[np.isfinite(forces).all(0)]
-    if len(visited):
-        track.set_xlim(100 * visited.min(), 100 * visited.max())
+    known = places[np.isfinite(forces).all(0)]
+    if len(known):
+        track.set_xlim(100 * known.min(), 100 * known.max())
     _draw_members(learning, updates, losses, "updates", "validation loss")
     learning.set_xlim(0, updates[-1])
     learning.set_ylim(bottom=0)

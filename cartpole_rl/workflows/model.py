@@ -36,7 +36,7 @@ from cartpole_rl.reporting.predictions import (
     PHYSICS,
     REPORTED_TIMES,
     ensemble_figure,
-    model_table,
+    error_table,
     spread_table,
 )
 from cartpole_rl.reporting.style import save
@@ -93,7 +93,7 @@ def learn_model(config: ModelConfig, folder: Path) -> None:
     write_json(folder / MODELLED, {**data, **results(model, ensemble, windows, errors)})
     subtitle = f"{count_text(len(episodes))}, pole={pole_name}, {windows.number} held-out windows"
     save(ensemble_figure(physics, learned, ensemble, subtitle), folder / FIGURE)
-    print(model_table(errors, f"errors on {windows.number} held-out windows, over the time predicted"))
+    print(error_table(errors, f"errors on {windows.number} held-out windows, over the time predicted"))
     print(
         f"\n{spread_table(errors[LEARNED], CERTAIN, 'RMS errors and ensemble spreads on the same windows')}"
     )

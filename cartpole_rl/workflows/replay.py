@@ -24,7 +24,7 @@ from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.windows import lead_periods
 from cartpole_rl.randomization.poles import Pole
 from cartpole_rl.reporting.episodes import columns
-from cartpole_rl.reporting.predictions import REPORTED_TIMES, replay_figure, replay_table
+from cartpole_rl.reporting.predictions import REPORTED_TIMES, error_table, replay_figure
 from cartpole_rl.reporting.style import save
 from cartpole_rl.reporting.texts import count_text
 from cartpole_rl.reporting.web_view import WebView
@@ -80,9 +80,9 @@ def replay_recordings(config: ReplayConfig, folder: Path) -> None:
     count = count_text(len(episodes))
     subtitle = f"above: {paths[0].name},  below: {count},  pole={name}"
     save(replay_figure(replays, period, REPORTED_TIMES, "Measured and simulated", subtitle), folder / FIGURE)
-    print(replay_table(errors, f"errors of {count}, pole={name}, over the time since a reset"))
+    print(error_table({"": errors}, f"errors of {count}, pole={name}, over the time since a reset"))
     if away:
-        print(replay_table(away, "the same away from upright; near it an error grows e times in 0.15 s"))
+        print(error_table({"": away}, "the same away from upright; near it an error grows e times in 0.15 s"))
     needs_cart = settings.hardware != nominal_hardware() and not words_given("cart")
     of_cart = [*["cart=<yours>.yaml"] * needs_cart, *words_given("cart", "pole")]
     following = ["cartpole-model", as_word("from", shown(config.source)), *of_cart]

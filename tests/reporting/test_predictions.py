@@ -1,5 +1,7 @@
 """Figures and tables of prediction errors show what they were given, in the units that they name."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -8,18 +10,14 @@ from figure_contents import line_of
 from cartpole_rl.drawing import colours
 from cartpole_rl.identification.prediction import Prediction
 from cartpole_rl.physics.residual import PLACES, Residual
-from cartpole_rl.reporting.predictions import (
-    forces_along_track,
-    learned_model_figure,
-    replay_table,
-)
+from cartpole_rl.reporting.predictions import ensemble_figure, error_table, forces_along_track
 
 ERRORS = {"rms_x_mm": 1.234, "median_x_mm": 1.0, "rms_theta_deg": 0.5, "median_theta_deg": 0.25}
 
 
 def test_a_replay_has_a_row_for_each_time() -> None:
-    heading, columns, _, *rows = replay_table(
-        [{"after_s": time, **ERRORS} for time in (0.1, 1.0)], "errors"
+    heading, columns, _, *rows = error_table(
+        {"": [{"after_s": time, **ERRORS} for time in (0.1, 1.0)]}, "errors"
     ).splitlines()
     assert heading == "errors"
     assert columns.split("  ")[0] == "time (s)"
@@ -49,9 +47,14 @@ def test_errors_are_in_the_units_of_the_axes() -> None:
     physics, learned = (
         Prediction(*(np.full((51, 2, 7), each) for each in (0.1, error, 0.005))) for error in (0.02, 0.01)
     )
-    places, forces = forces_along_track(with_tables(torch.ones(3, PLACES)), np.linspace(-0.1, 0.1, 500))
-    updates, losses = np.array([0.0, 20.0]), np.ones((2, 3))
-    figure = learned_model_figure(0.02, physics, learned, places, forces, updates, losses)
+    ensemble = SimpleNamespace(
+        dynamics=SimpleNamespace(period=0.02),
+        best=with_tables(torch.ones(3, PLACES)),
+        positions=torch.linspace(-0.1, 0.1, 500).reshape(-1, 1, 1).expand(-1, 2, 1),
+        updates=[0, 20],
+        history=[[1.0] * 3] * 2,
+    )
+    figure = ensemble_figure(physics, learned, ensemble, "")
     cart, angle, track, learning = figure.axes
     assert line_of(cart, colours.VERMILLION)[:, 1] == pytest.approx(20)
     assert line_of(angle, colours.BLUE)[:, 1] == pytest.approx(np.degrees(0.01))
