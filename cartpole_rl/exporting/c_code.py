@@ -12,6 +12,7 @@ from typing import Any
 
 from cartpole_rl.arithmetic.languages import C99, Operand
 from cartpole_rl.arithmetic.writer import Expressions, Writer
+from cartpole_rl.emulator.c_firmware import in_comment
 from cartpole_rl.envs.settings import CartPoleSettings
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.exporting.agent import ExportedAgent, Floats
@@ -109,11 +110,6 @@ def header(agent: ExportedAgent, later: str) -> str:
         else "not read by this agent.",
     }
     return filled("policy.h", values)
-
-
-def in_comment(text: str) -> str:
-    """Return text as one line within a comment; it neither ends the comment nor opens another."""
-    return " ".join(text.split()).replace("*/", "* /").replace("/*", "/ *")
 
 
 def source(agent: ExportedAgent, first: str, later: str) -> str:

@@ -110,4 +110,5 @@ def test_the_shipped_header_is_that_of_ip02():
     """Write it again after a change: cartpole-export format=firmware cart=ip02."""
     shipped = (firmware_folder() / "src" / "cart_rig.h").read_text(encoding="utf-8")
     assert shipped == rig_header(nominal_hardware(), "cart=ip02")
+    assert rig_header(nominal_hardware(), "cart=/*/\n*/mine.yaml").count("*/") == shipped.count("*/")
     assert [*c_firmware.RIG] == re.findall(r"#ifndef (?!CART_RIG_H)(\w+)", shipped)
