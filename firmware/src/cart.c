@@ -381,7 +381,7 @@ static void see_switches(cart *self, int32_t cart_count)
 
 void cart_look(cart *self, uint64_t now_us, int32_t cart_count, int32_t pole_count)
 {
-    expire(self, now_us);
+    self->interrupted |= expire(self, now_us); /* it may end before the next tick */
     if (CART_SWITCHES)
         see_switches(self, cart_count);
     cart_limits_sample(&self->limits, now_us, cart_count, pole_count);

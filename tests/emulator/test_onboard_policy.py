@@ -186,6 +186,21 @@ def test_a_motor_value_of_the_host_takes_over_until_the_next_start_policy():
     assert board.observed[-1][5:7] == (True, False)  # first, resumed
 
 
+def test_it_is_told_of_a_watchdog_stop_that_ends_before_the_next_tick():
+    board, motors = Board(lambda seen: 100), []
+    board.tick()
+    board.heard()
+    board.tick()
+    for board.now_us in range(61_000, 85_000, 1000):  # the next tick is late
+        board.firmware.look(board.now_us, 0, 0)
+        motors.append(board.firmware.motor)
+        if board.now_us == 82_000:
+            board.send(Hello())
+    board.firmware.tick(85_000, 0, 0)
+    assert motors == [100] * 19 + [0] * 5
+    assert board.observed[-1][5:7] == (False, True)  # first, resumed
+
+
 @pytest.mark.parametrize("side", [1, -1])
 def test_the_soft_limit_holds_for_it(side):
     board = Board(lambda seen: side * 100)
