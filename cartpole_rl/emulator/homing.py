@@ -290,7 +290,7 @@ class Homing:
             self._check_switches(reading)
             if switch and reading.pressed & switch == until:
                 return reading
-            far = expected is not None and abs(expected - reading.cart) * self._nanometres > self._touch_zone
+            far = expected is not None and (expected - reading.cart) * self._nanometres > self._touch_zone
             speed = (reading.cart - before.cart) * self._metres / reading.seconds
             fast = pole_speed(before, reading) > self._fast
             if elapsed <= reading.us or fast:  # two readings give the first speed

@@ -141,7 +141,7 @@ static outcome touch_stop(cart_homing *homing, const cart_reading *reading, int 
     if (CART_SWITCHES && ((homing->pressed & side) != 0) == pressed)
         return ENDS;
     int64_t expected = (int64_t)homing->zeros.left_stop + CART_COUNTS(CART_SPAN_UM);
-    int64_t away = expected > reading->cart ? expected - reading->cart : reading->cart - expected;
+    int64_t away = expected - reading->cart;
     bool far = direction > 0 && EXPECTS_RIGHT(homing) && away * CART_NANOMETRES > TOUCH_ZONE_NM;
     double speed = cart_speed(homing, reading);
     if (goes_astray(homing, reading, direction, speed))

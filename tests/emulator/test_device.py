@@ -70,6 +70,14 @@ def test_a_track_of_the_wrong_length_is_a_fault(half_length):
     assert driven.flags == Flags.FAULTED
 
 
+def test_a_longer_track_is_searched_slowly_beyond_the_expected_stop():
+    driven, touched = Driven(track_half_length=0.5), []
+    driven.cart.physics.on_contact = touched.append
+    assert driven.home().fault == Fault.HOMING
+    assert len(touched) > 1  # the right stop, too
+    assert max(touched) < 0.15
+
+
 def test_the_limits_are_nominal_until_homing_has_found_the_stops():
     driven = Driven(track_half_length=0.4)
     assert driven.limits() == NOMINAL_LIMITS
