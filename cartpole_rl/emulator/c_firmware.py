@@ -216,7 +216,8 @@ def rig_header(hardware: Hardware, source: str, lever: int = LEVER) -> str:
         for name, value in rig_macros(hardware, lever).items()
     ]
     about = (
-        f"/* Encoders, track, motor and pole of {in_comment(source)}. cartpole-export format=firmware writes this file;\n"
+        f"/* Encoders, track, motor and pole of {in_comment(source)}."
+        " cartpole-export format=firmware writes this file;\n"
         "   flags -D override single numbers. No count is converted: the host needs the same numbers. */\n"
     )
     return f"{about}#ifndef CART_RIG_H\n#define CART_RIG_H\n\n{''.join(macros)}\n#endif\n"
