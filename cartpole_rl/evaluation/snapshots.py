@@ -7,6 +7,7 @@ cart in any case. Nothing is locked. A counter that is odd during a write lets t
 import multiprocessing
 import struct
 import time
+from collections.abc import Iterable
 from ctypes import Array, c_char
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -69,62 +70,52 @@ def followed(env: "CartPoleEnv", memory: Memory | None, row: int = 0) -> "CartPo
     Of many simulated carts it is that of `row`, and they are driven at the pace of a real one.
     """
     if memory is not None and env.plant.drives_one_cart:
-        env.plant.on_command = Publisher(env, memory)
+        env.plant.on_command = Publisher(env, memory).on_command
     elif memory is not None:
-        env.on_step = RowPublisher(env, memory, row)
+        env.on_step = Publisher(env, memory, row).on_step
     return env
 
 
 class Publisher:
-    """Writes a snapshot to `memory` when it is called, each time a motor value has been sent to the cart."""
+    """Writes snapshots of the cart in `row` to `memory`, one a period."""
 
-    def __init__(self, env: "CartPoleEnv", memory: Memory) -> None:
-        self._cart, self._statistics, self._memory = env.one_cart, env.plant.statistics, memory
-        (self._track_half_length,) = env.plant.track_half_length.tolist()
+    def __init__(self, env: "CartPoleEnv", memory: Memory, row: int = 0) -> None:
+        self._env, self._memory, self._row = env, memory, row
         self._written = self._episode = 0
         self._score = 0.0
+        self._ended = False
 
-    def __call__(self, motor: int) -> None:
-        """Write the state that the motor value was chosen on."""
-        percept = self._cart.percept
+    def on_command(self, motor: int) -> None:
+        """Write the state of one cart that a motor value was chosen on, once that has been sent."""
+        percept = self._env.one_cart.percept
         (step,), (guard,), (score,) = percept.step_count, percept.guard, percept.score
+        self._publish(step, motor, guard, score, percept.state)
+
+    def on_step(self, stepped: "TensorDictBase") -> None:
+        """Write the state of one of many carts, and the motor value chosen on it; wait for the time it takes.
+
+        Once the first episode of that cart has ended, nothing is written until the next reset, and nothing
+        waits.
+        """
+        cart, period = stepped[self._row], self._env.plant.period
+        step = int(cart["step_count"])
+        if step == 0:
+            self._due, self._ended = time.monotonic(), False
+        if self._ended:
+            return
+        motor = int(self._env.hardware.sent_motors(cart["action"].reshape(1), cart["guard"]))
+        self._publish(step, motor, int(cart["guard"]), float(cart["score"]), cart["state"].tolist())
+        self._ended = bool(cart["next", "done"])
+        self._due = max(self._due + period, time.monotonic() - period)
+        time.sleep(max(0.0, self._due - time.monotonic()))
+
+    def _publish(self, step: int, motor: int, guard: int, score: float, state: Iterable[float]) -> None:
         if step == 0:
             self._episode += 1
             self._score = 0.0
         self._score += score
         self._written += 1
-        statistics = self._statistics
-        present = self._episode, step, motor, guard, statistics.late_ticks, statistics.lost_frames
-        snapshot = (*present, *percept.state, self._score, self._track_half_length)
+        plant = self._env.plant
+        present = self._episode, step, motor, guard, plant.statistics.late_ticks, plant.statistics.lost_frames
+        snapshot = (*present, *state, self._score, float(plant.track_half_length[self._row]))
         write(self._memory, self._written, Snapshot._make(snapshot))
-
-
-class RowPublisher:
-    """Writes a snapshot of one of many carts to `memory` after each step, and waits for the time it takes.
-
-    Once the first episode of that cart has ended, nothing is written until the next reset, and nothing waits.
-    """
-
-    def __init__(self, env: "CartPoleEnv", memory: Memory, row: int) -> None:
-        self._env, self._memory, self._row = env, memory, row
-        self._written = self._episode = 0
-        self._ended = False
-
-    def __call__(self, stepped: "TensorDictBase") -> None:
-        """Write the state of `stepped`, and the motor value that was chosen on it."""
-        cart, plant = stepped[self._row], self._env.plant
-        step = int(cart["step_count"])
-        if step == 0:
-            self._episode += 1
-            self._score, self._due, self._ended = 0.0, time.monotonic(), False
-        if self._ended:
-            return
-        self._score += float(cart["score"])
-        self._written += 1
-        motor = int(self._env.hardware.sent_motors(cart["action"].reshape(1), cart["guard"]))
-        present, track = (self._episode, step, motor, int(cart["guard"])), plant.track_half_length[self._row]
-        snapshot = (*present, 0, 0, *cart["state"].tolist(), self._score, float(track))
-        write(self._memory, self._written, Snapshot._make(snapshot))
-        self._ended = bool(cart["next", "done"])
-        self._due = max(self._due + plant.period, time.monotonic() - plant.period)
-        time.sleep(max(0.0, self._due - time.monotonic()))
