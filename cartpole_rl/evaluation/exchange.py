@@ -37,7 +37,6 @@ from cartpole_rl.evaluation.recordings import (
     TURN,
     Recording,
     episode_of,
-    pole_length,
     rows_of,
 )
 from cartpole_rl.files import replacing
@@ -140,7 +139,7 @@ def arrays(recording: Recording, agent: CartPoleSettings, indexed: bool) -> dict
     terminated = episode.ended_by in TERMINATED
     steps = [name for name in (*OF_STEP, GUARDED) if name in rows[0]]
     return {
-        "observations": observations(episode, pole_length(Path(recording.name), recording.facts), agent),
+        "observations": observations(episode, recording.pole_length, agent),
         "actions": np.array([agent.actions.motors.index(value) for value in motor.tolist()])
         if indexed
         else (motor[:, None] / LARGEST_MOTOR).astype(np.float32),

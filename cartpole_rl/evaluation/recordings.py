@@ -45,6 +45,17 @@ class Recording(NamedTuple):
     episode: Episode
     facts: Mapping[str, str]
 
+    @property
+    def pole_length(self) -> float | None:
+        """The pole's length (m) in the heading; None where it has none. Raises RecordingError."""
+        text = self.facts.get(LENGTH)
+        try:
+            return float(text) if text else None
+        except ValueError:
+            raise RecordingError(
+                f"recording {self.name} is damaged: {LENGTH} is {text!r}, and not a number"
+            ) from None
+
 
 def write_recording(path: Path, episode: Episode, facts: Mapping[str, Any] | None = None) -> None:
     """Write one episode atomically; `facts` are added to the heading."""
@@ -74,15 +85,15 @@ def rows_of(episode: Episode) -> list[dict[str, float]]:
     return rows
 
 
-def read_recording(path: Path) -> Episode:
-    """Read the episode in a file, also as a spreadsheet program saved it.
+def read_recording(path: Path) -> Recording:
+    """Read a recording's file, also as a spreadsheet program saved it.
 
     Raises RecordingError if it is damaged or not a recording.
     """
     facts, text = read_heading(path)
     if facts.get("format") != FORMAT:
         raise RecordingError(f"{path} is not a recording: its first line is not '# format: {FORMAT}'")
-    return episode_of(path, facts, list(csv.DictReader(text)))
+    return Recording(path.stem, episode_of(path, facts, list(csv.DictReader(text))), facts)
 
 
 def episode_of(path: Path, facts: Mapping[str, str], rows: Sequence[Mapping[str, str]]) -> Episode:
@@ -124,15 +135,6 @@ def episode_of(path: Path, facts: Mapping[str, str], rows: Sequence[Mapping[str,
     )
 
 
-def pole_length(path: Path, facts: Mapping[str, str]) -> float | None:
-    """Return the pole's length (m) in a heading; None where it has none. Raises RecordingError."""
-    text = facts.get(LENGTH)
-    try:
-        return float(text) if text else None
-    except ValueError:
-        raise RecordingError(f"{path} is damaged: {LENGTH} is {text!r}, and not a number") from None
-
-
 def _motor_before(path: Path, text: str) -> tuple[int, ...]:
     """Return the motor values in a heading. Raises RecordingError for impossible ones."""
     try:
@@ -154,11 +156,6 @@ def _encoders(path: Path, facts: Mapping[str, str]) -> Encoders:
     except (ValueError, ConfigError) as error:
         wrong = str(error).removeprefix("cart.")
         raise RecordingError(f"{path} is damaged: in its heading, {wrong}") from None
-
-
-def load_recording(path: Path) -> Recording:
-    """Return the recording in a file. Raises RecordingError, as `read_recording`."""
-    return Recording(path.stem, read_recording(path), read_heading(path)[0])
 
 
 def read_heading(path: Path) -> tuple[dict[str, str], list[str]]:

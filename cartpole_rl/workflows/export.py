@@ -9,7 +9,7 @@ from cartpole_rl.emulator.c_firmware import rig_header
 from cartpole_rl.emulator.guards import lever_um
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.exchange import MinariData, write_mcap
-from cartpole_rl.evaluation.recordings import load_recording
+from cartpole_rl.evaluation.recordings import read_recording
 from cartpole_rl.exporting.agent import ExportedAgent
 from cartpole_rl.exporting.c_code import c_files
 from cartpole_rl.exporting.onnx_model import onnx_model
@@ -63,7 +63,7 @@ def write_recordings(config: ExportConfig, folder: Path) -> None:
     """Write the recordings of `config.source` as a data set of Minari, or each as a file of MCAP."""
     assert config.source is not None
     paths = recordings(config.source)
-    loaded, settings = [*map(load_recording, paths)], recorded_cart(paths)
+    loaded, settings = [*map(read_recording, paths)], recorded_cart(paths)
     data = MinariData(loaded, settings) if config.format == "minari" else None
     write_config(folder, "export", {**config.model_dump(mode="json", by_alias=True), "seed": None})
     if data is None:

@@ -60,7 +60,7 @@ class FinetuningFiles:
 
     def episode(self, stage: Stage, number: int) -> Episode:
         """Read an episode. Raises RecordingError."""
-        return read_recording(self.path(stage, number))
+        return read_recording(self.path(stage, number)).episode
 
     def check(self, learned: int) -> None:
         """Raise RecordingError if an episode is missing before a recorded one, or one of the `learned`."""
@@ -84,7 +84,7 @@ class FinetuningFiles:
         """Read the recorded episodes that the learner gets, from number `first`: evaluations come first."""
         stages = (Stage.BEFORE, Stage.TUNE)
         paths = [self.path(stage, number) for stage in stages for number in range(self.count(stage))]
-        return [read_recording(path) for path in paths[first:]]
+        return [read_recording(path).episode for path in paths[first:]]
 
     def write_episode(self, stage: Stage, number: int, episode: Episode) -> None:
         """Write an episode's recording."""

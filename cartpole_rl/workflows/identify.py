@@ -110,10 +110,11 @@ def identify_cart(config: IdentifyConfig, folder: Path) -> None:
                 print("cartpole-identify", *words)
             raise
     files = experiments(source)
-    recorded = {name: read_recording(path) for name, path in files.items()}
+    loaded = {name: read_recording(path) for name, path in files.items()}
+    recorded = {name: each.episode for name, each in loaded.items()}
     check_same_encoders({str(files[name]): episode for name, episode in recorded.items()}, config.hardware)
     if config.source is not None:
-        warn_of_another_pole(config.pole.nominal, files.values())
+        warn_of_another_pole(config.pole.nominal, loaded.values())
     fitted, held_out = split(recorded)
     by_file, held_out_by_file = (
         {str(files.get(name, name)): episode for name, episode in chosen.items()}

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import yaml
 from pydantic import Field, TypeAdapter
@@ -14,6 +14,9 @@ from cartpole_rl.errors import ConfigError
 from cartpole_rl.plants.settings import PlantSettings, PortSettings, changed_words, emulated_pole
 from cartpole_rl.randomization.poles import HEAVIER, Pole, PoleSettings, check_one_pole, one_pole
 from cartpole_rl.run_folder import CONFIG
+
+if TYPE_CHECKING:
+    from cartpole_rl.evaluation.recordings import Recording  # imports PyTorch
 
 PRETRAINED = ("medium", "large")  # poles of pretrained agents; the first is the default
 POLES = (*PRETRAINED, "rod_03", "sensorsini", "laboratorio")  # in conf/pole/ and conf/emulator/
@@ -111,7 +114,7 @@ def words_of_run(folder: Path) -> str | None:
 
 
 def chosen_pole(
-    owner: str, poles: PoleSettings | None, paths: Sequence[Path], own: PoleSettings | None = None
+    owner: str, poles: PoleSettings | None, recordings: Sequence["Recording"], own: PoleSettings | None = None
 ) -> tuple[str, Pole]:
     """Return name and parameters of the pole in `poles`; without a choice, of the recorded one, as in `own`.
 
@@ -119,27 +122,29 @@ def chosen_pole(
     several, naming `owner`, and what `recorded_pole` raises.
     """
     if poles is None:
-        return recorded_pole(paths, own.choices if own else None)
+        return recorded_pole(recordings, own.choices if own else None)
     pole = check_one_pole(owner, poles)
-    warn_of_another_pole(pole, paths)
+    warn_of_another_pole(pole, recordings)
     return poles.name, pole
 
 
-def warn_of_another_pole(pole: Pole, paths: Iterable[Path]) -> None:
+def warn_of_another_pole(pole: Pole, recordings: Iterable["Recording"]) -> None:
     """Print a warning where a recording states the length of another pole. Raises RecordingError."""
-    recorded = {length for path in paths if (length := recorded_length(path))}
+    recorded = {length for each in recordings if (length := each.pole_length)}
     if others := [f"{length:g} m" for length in sorted(recorded) if not pole.is_about(length)]:
         print(f"warning: a pole of {' and '.join(others)} was recorded; pole= gives one of {pole.length:g} m")
 
 
-def recorded_pole(paths: Sequence[Path], own: Mapping[str, Pole] | None = None) -> tuple[str, Pole]:
+def recorded_pole(
+    recordings: Sequence["Recording"], own: Mapping[str, Pole] | None = None
+) -> tuple[str, Pole]:
     """Return the one of `own` or POLES with the recorded length; the first where no recording states it.
 
-    Raises ConfigError for several lengths or the length of another pole, RecordingError for a damaged header.
+    Raises ConfigError for several lengths or the length of another pole, RecordingError for a damaged one.
     """
     shipped = {name: Pole(**choice(f"pole/{name}")["choices"][name]) for name in POLES}
     known = {**(own or {}), **{name: pole for name, pole in shipped.items() if name not in (own or {})}}
-    lengths = sorted({length for path in paths if (length := recorded_length(path))})
+    lengths = sorted({length for each in recordings if (length := each.pole_length)})
     if not lengths:
         return next(iter(known.items()))
     if len(lengths) > 1:
@@ -150,10 +155,3 @@ def recorded_pole(paths: Sequence[Path], own: Mapping[str, Pole] | None = None) 
         if pole.is_about(length):
             return name, pole
     raise ConfigError(f"pole: one of {length:g} m was recorded; give one of {', '.join(POLES)}, or your own")
-
-
-def recorded_length(path: Path) -> float | None:
-    """Return the pole's length (m) in a recording's header; None where it has none. Raises RecordingError."""
-    from cartpole_rl.evaluation.recordings import pole_length, read_heading  # imports PyTorch
-
-    return pole_length(path, read_heading(path)[0])

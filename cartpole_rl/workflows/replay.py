@@ -49,13 +49,14 @@ def replay_recordings(config: ReplayConfig, folder: Path) -> None:
     recordings, ConfigError for unknown parameters, several poles, or a folder that already holds a run.
     """
     paths = recordings(config.source)
-    episodes = [read_recording(path) for path in paths]
+    loaded = [read_recording(path) for path in paths]
+    episodes = [each.episode for each in loaded]
     settings = recorded_cart(paths) or load_settings(TrainConfig)
     given = {name: value for name in GROUPS if (value := getattr(config, name)) is not None}
     settings = settings.model_copy(update=given)
     by_file = {str(path): each for path, each in zip(paths, episodes, strict=True)}
     check_same_encoders(by_file, settings.hardware)
-    name, pole = chosen_pole("a replay", config.pole, paths, settings.pole)
+    name, pole = chosen_pole("a replay", config.pole, loaded, settings.pole)
     parameters = {**settings.nominal_with(pole), **(config.parameters or {})}
     check_names(parameters, "parameters")
     check_values(parameters)

@@ -83,7 +83,7 @@ def imported(logs: Iterable[Path], run: Path, *words: str) -> Path:
 
 def recordings(run: Path) -> dict[str, Episode]:
     """Return the recordings of a run by name."""
-    return {path.stem: read_recording(path) for path in sorted((run / RECORDINGS).iterdir())}
+    return {path.stem: read_recording(path).episode for path in sorted((run / RECORDINGS).iterdir())}
 
 
 def stretches(recorded: Iterable[Episode], period: float = PERIOD) -> Windows:
@@ -199,7 +199,7 @@ def subsets(recorded: Sequence[Path], seconds: float, seed: int) -> list[Path]:
     chosen, total = [], 0.0
     for index in order:
         chosen.append(recorded[index])
-        total += PERIOD * read_recording(recorded[index]).steps
+        total += PERIOD * read_recording(recorded[index]).episode.steps
         if total >= 1.4 * seconds:
             break
     return chosen

@@ -95,7 +95,7 @@ def test_an_episode_is_recorded_again(trained: Path, evaluated: Path) -> None:
     assert done.code == 0, done.err
     (path,) = (evaluated / "recorded/recordings").iterdir()
     then = read(evaluated / "wide")
-    assert read_recording(path).score.sum() == then["episodes"][5]["score"]
+    assert read_recording(path).episode.score.sum() == then["episodes"][5]["score"]
     heading = dict(line[2:].split(": ", 1) for line in path.read_text().splitlines() if line[0] == "#")
     origin = read_origin(then, 5)
     assert json.loads(heading["cart"]) == origin.parameters

@@ -32,7 +32,7 @@ from cartpole_rl.workflows.finetuning_cart import FinetuningFiles
 def test_every_episode_is_on_disk_once(tuned: tuple[Path, Outcome]) -> None:
     run, _ = tuned
     assert [*contents(run)] == ["after_000.csv", "before_000.csv", "tune_000.csv", "tune_001.csv"]
-    assert all(read_recording(path).steps > 1 for path in (run / "recordings").iterdir())
+    assert all(read_recording(path).episode.steps > 1 for path in (run / "recordings").iterdir())
 
 
 def test_the_better_policy_is_kept_and_reported(tuned: tuple[Path, Outcome]) -> None:

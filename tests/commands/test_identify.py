@@ -78,7 +78,7 @@ def test_offline_is_as_online(run: Path, results: dict[str, Any], tmp_path: Path
 def test_the_cart_is_fitted_with_the_period_of_its_recordings(run: Path, tmp_path: Path) -> None:
     """Of 20.3 ms, which is near enough to the setting of 20 ms not to be refused."""
     for path in (run / "recordings").iterdir():
-        episode = read_recording(path)
+        episode = read_recording(path).episode
         write_recording(tmp_path / "slower" / path.name, replace(episode, time=1.015 * episode.time))
     found = []
     for folder, word in {"default": "label=", "given": "control_period=0.0203"}.items():

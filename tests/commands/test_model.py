@@ -58,7 +58,7 @@ def test_recordings_that_teach_a_wrong_model_are_refused(
     change: dict[str, float], said: str, recorded: Path, tmp_path: Path
 ) -> None:
     for path in experiments(recorded).values():
-        episode = read_recording(path)
+        episode = read_recording(path).episode
         if "motor" in change or path.stem == "episode_001":
             episode = replace(episode, **{name: by * getattr(episode, name) for name, by in change.items()})
         write_recording(tmp_path / path.name, episode)
@@ -92,7 +92,7 @@ def test_recordings_of_no_cart_teach_nothing(
     change: Callable[[Episode], Episode], said: str, recorded: Path, tmp_path: Path
 ) -> None:
     for path in experiments(recorded).values():
-        episode = read_recording(path)
+        episode = read_recording(path).episode
         write_recording(tmp_path / path.name, change(episode) if path.stem == "episode_001" else episode)
     done = in_process("model", f"from={tmp_path}", *SMALL, "hydra.run.dir=run", folder=tmp_path)
     assert done.code == 2

@@ -21,7 +21,7 @@ def test_every_episode_of_an_agent_is_a_file(trained: Path, tmp_path: Path) -> N
     assert done.out.splitlines()[-1] == "cartpole-replay from=run"
     paths = sorted((tmp_path / "run/recordings").iterdir())
     assert [path.name for path in paths] == [f"episode_00{number}.csv" for number in range(3)]
-    assert all(read_recording(path).steps > 1 for path in paths)
+    assert all(read_recording(path).episode.steps > 1 for path in paths)
     assert {
         "# plant: simulated",
         "# pole: medium",
@@ -40,7 +40,7 @@ def test_the_baseline_drives_the_emulated_cart_with_its_own_pole(tmp_path: Path)
     assert done.code == 0, done.err
     path = tmp_path / "run/recordings/episode_000.csv"
     assert {"# plant: emulated", "# pole_length_m: 0.6560", "# run: lqr"} <= headings(path)
-    assert math.remainder(read_recording(path).theta[-1], math.tau) == pytest.approx(0, abs=0.1)
+    assert math.remainder(read_recording(path).episode.theta[-1], math.tau) == pytest.approx(0, abs=0.1)
 
 
 def test_the_baseline_knows_the_nominal_cart_and_not_the_simulated_one(tmp_path: Path) -> None:
@@ -54,7 +54,9 @@ def test_the_baseline_knows_the_nominal_cart_and_not_the_simulated_one(tmp_path:
             f"hydra.run.dir={run}",
         )
         assert in_process("record", *words, folder=tmp_path).code == 0
-    first = [read_recording(tmp_path / run / "recordings/episode_000.csv") for run in ("nominal", "other")]
+    first = [
+        read_recording(tmp_path / run / "recordings/episode_000.csv").episode for run in ("nominal", "other")
+    ]
     assert first[0].motor[0] == first[1].motor[0]
     assert abs(first[1].x[3] - first[1].x[0]) > 1.3 * abs(first[0].x[3] - first[0].x[0])
 
@@ -83,4 +85,4 @@ def test_an_interrupt_keeps_the_finished_episodes(tmp_path: Path) -> None:
     assert done.err.endswith("cartpole-record: interrupted\n")
     paths = sorted((tmp_path / "run/recordings").glob("*.csv"))
     assert f"holds {len(paths)} episode" in done.out
-    assert all(read_recording(path).ended_by == "time" for path in paths)
+    assert all(read_recording(path).episode.ended_by == "time" for path in paths)

@@ -86,7 +86,7 @@ def test_the_page_is_a_path(tmp_path: Path, serial_port: Callable[..., str]) -> 
             assert following == f"cartpole-model from=runs/record/{runs['record']}"
             following = ""
     experiments = (tmp_path / "runs/identify").glob("*/recordings/*.csv")
-    motion = sum(read_recording(path).steps for path in experiments) * 0.02 / 60
+    motion = sum(read_recording(path).episode.steps for path in experiments) * 0.02 / 60
     assert motion < minutes("About {} minutes of motion") < motion + 2  # homing and rests included
     reported = (tmp_path / "runs/report" / runs["report"] / "runs.csv").read_text().splitlines()
     assert len(reported) == 1 + 4

@@ -133,7 +133,7 @@ def lay_out_logs(folder: Path) -> None:
     (folder / "logs").mkdir()
     (folder / "mine.yaml").write_text("defaults: [medium]\n")
     for path in (folder / "runs/identify/first/recordings").glob("*.csv"):
-        episode = read_recording(path)
+        episode = read_recording(path).episode
         motor = np.concatenate(([0], episode.motor)) * -4706 / 255
         angle = (3344 - 4271 * episode.theta / (2 * np.pi)) % 4271
         rows = zip(-episode.x / 8.498e-5, angle, motor, strict=True)

@@ -8,7 +8,7 @@ from short_episode import EPISODE, FULL
 
 from cartpole_rl.errors import RecordingError
 from cartpole_rl.evaluation.exchange import read_mcap, write_mcap
-from cartpole_rl.evaluation.recordings import load_recording, write_recording
+from cartpole_rl.evaluation.recordings import read_recording, write_recording
 
 REASON = 'mcap is missing: pip install "cartpole_rl[mcap]"'
 writer = pytest.importorskip("mcap.writer", reason=REASON)
@@ -18,7 +18,7 @@ reader = pytest.importorskip("mcap.reader", reason=REASON)
 @pytest.fixture
 def file(tmp_path: Path) -> Path:
     write_recording(tmp_path / "one.csv", EPISODE, {"pole": "medium"})
-    write_mcap(tmp_path / "one.mcap", load_recording(tmp_path / "one.csv"), None)
+    write_mcap(tmp_path / "one.mcap", read_recording(tmp_path / "one.csv"), None)
     return tmp_path / "one.mcap"
 
 
@@ -42,7 +42,7 @@ def test_any_reader_finds_json_messages_with_a_schema(file: Path) -> None:
 
 def test_all_that_a_recording_holds_comes_back(tmp_path: Path) -> None:
     write_recording(tmp_path / "one.csv", FULL, {"pole": "", "cart": '{"latency": 0.1}'})
-    write_mcap(tmp_path / "one.mcap", load_recording(tmp_path / "one.csv"), None)
+    write_mcap(tmp_path / "one.mcap", read_recording(tmp_path / "one.csv"), None)
     (name, episode, facts), _ = read_mcap(tmp_path / "one.mcap")
     write_recording(tmp_path / "again.csv", episode, facts)
     assert name == "one"

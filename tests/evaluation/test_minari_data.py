@@ -12,7 +12,7 @@ from cartpole_rl.envs.build import shipped_settings
 from cartpole_rl.envs.settings import CartPoleSettings
 from cartpole_rl.errors import ConfigError, RecordingError
 from cartpole_rl.evaluation.exchange import MinariData, read_minari
-from cartpole_rl.evaluation.recordings import Recording, load_recording, write_recording
+from cartpole_rl.evaluation.recordings import Recording, read_recording, write_recording
 from cartpole_rl.tasks.episode import Episode
 
 minari = pytest.importorskip("minari", reason='minari is missing: pip install "cartpole_rl[minari]"')
@@ -79,7 +79,7 @@ def test_observations_are_those_that_the_environment_gave(root: Path, settings: 
 
 def test_all_that_a_recording_holds_comes_back(tmp_path: Path) -> None:
     write_recording(tmp_path / "one.csv", FULL, {"pole": "", "cart": '{"latency": 0.1}'})
-    MinariData([load_recording(tmp_path / "one.csv")], None).write(tmp_path / "data", NAME)
+    MinariData([read_recording(tmp_path / "one.csv")], None).write(tmp_path / "data", NAME)
     [(name, episode, facts)], _ = read_minari(tmp_path / "data")
     write_recording(tmp_path / "again.csv", episode, facts)
     assert name == "one"

@@ -39,7 +39,7 @@ def with_cell(text: str, row: int, column: str, value: str) -> str:
 
 def test_a_recording_round_trips(tmp_path: Path, episode: Episode) -> None:
     write_recording(tmp_path / "deep" / "one.csv", episode)
-    again = read_recording(tmp_path / "deep" / "one.csv")
+    again = read_recording(tmp_path / "deep" / "one.csv").episode
     assert again.origin is None  # no column of it; cartpole-record writes it into the heading
     for field in dataclasses.fields(Episode):
         if field.name != "origin":
@@ -109,7 +109,7 @@ def test_a_file_that_a_spreadsheet_program_saved_is_read(tmp_path: Path, episode
         "\n".join([f"{line}{commas}" for line in quoted] + [",".join(row) for row in [names, *decimals]]),
         encoding="utf-8-sig",
     )
-    again = read_recording(path)
+    again = read_recording(path).episode
     np.testing.assert_array_equal(again.motor, episode.motor)
     np.testing.assert_array_equal(again.counts, episode.counts)
     assert (again.motor.dtype, again.counts.dtype) == (episode.motor.dtype, episode.counts.dtype)
@@ -119,10 +119,10 @@ def test_a_file_that_a_spreadsheet_program_saved_is_read(tmp_path: Path, episode
 def test_a_recording_keeps_the_encoders(episode: Episode, tmp_path: Path) -> None:
     path, encoders = tmp_path / "episode.csv", Encoders(4e-5, 2400)
     write_recording(path, dataclasses.replace(episode, encoders=encoders))
-    assert read_recording(path).encoders == encoders
+    assert read_recording(path).episode.encoders == encoders
     text = path.read_text()
     path.write_text("\n".join(line for line in text.splitlines() if "_per_" not in line or "," in line))
-    assert read_recording(path).encoders == nominal_encoders()
+    assert read_recording(path).episode.encoders == nominal_encoders()
     path.write_text(text.replace("# pole_counts_per_turn: 2400", "# pole_counts_per_turn: 3"))
     with pytest.raises(RecordingError, match="in its heading, pole_counts_per_turn is 3"):
         read_recording(path)

@@ -268,7 +268,7 @@ def test_a_part_knows_the_motor_values_before_it(
     assert tuple(values[489 + shift : 501 + shift]) in before  # 0.24 s
     assert tuple(values[797 + shift : 801 + shift]) in before  # since the gap
     write_recording(tmp_path / "part.csv", others[0])
-    assert read_recording(tmp_path / "part.csv").motor_before == others[0].motor_before
+    assert read_recording(tmp_path / "part.csv").episode.motor_before == others[0].motor_before
     windows = cut_windows(others[:1], PERIOD)
     history = windows.motors.shape[0] - windows.periods
     assert windows.motors[:history, 0].tolist() == [*others[0].motor_before][-history:]
@@ -608,5 +608,5 @@ def test_a_good_log_has_no_doubt_and_becomes_recordings(
     run, motion = tmp_path / "run", driven_pole(255, late)
     import_logs(imported(written(tmp_path / "log.csv", motion)), run)
     assert "doubt: " not in capsys.readouterr().out
-    episode = read_recording(run / "recordings" / "log_00.csv")
+    episode = read_recording(run / "recordings" / "log_00.csv").episode
     assert episode.theta == pytest.approx(motion["a"], abs=1e-3)

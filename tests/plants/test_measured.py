@@ -60,7 +60,7 @@ def test_nothing_after_a_frozen_count_is_kept(
     assert "the cart's count froze: the last " in caplog.text
     assert episode_metrics(episode, 0.4)["steps"] == steps
     write_recording(tmp_path / "episode.csv", episode)
-    assert read_recording(tmp_path / "episode.csv").steps == steps
+    assert read_recording(tmp_path / "episode.csv").episode.steps == steps
     assert f"\n# left_out: {episode.left_out}\n" in (tmp_path / "episode.csv").read_text()
 
 
