@@ -17,10 +17,11 @@ The brake acts while the cart is armed and after that until it has come to rest:
 watchdog or a fault leaves at speed would roll into an end stop. It never pushes a cart that stands or moves
 inward.
 
-A frozen encoder shows a cart that stands. While the count does not change, the cart's motion is estimated
-from its last speed and, while the pole is slow, from hard pushes. After 20 mm of it the cart is `lost`: its
-encoder is frozen, or something holds it. A lost cart is braked for the time that its estimated speed needs,
-or until its count changes. Friction can hold a cart against weaker pushes: they tell nothing.
+A frozen encoder shows a cart that stands; one with an open wire, one whose count changes to and fro by one.
+While the count changes by no more, the cart's motion is estimated from its last speed and, while the pole is
+slow, from hard pushes. After 20 mm or 100 counts of it, the larger, the cart is `lost`: its encoder is frozen,
+or something holds it. A lost cart is braked for the time that its estimated speed needs, or until its count
+changes by more. Friction can hold a cart against weaker pushes: they tell nothing.
 
 All numbers but one are whole, so that ``firmware/src/cart_guards.c`` and ``cart_limits.c`` decide the same.
 Periods are in microseconds.
@@ -97,8 +98,9 @@ class FrozenCartWatch:
     """Detects a cart count that does not change under hard pushes in both directions.
 
     Under a push one way only, the cart itself may be held by a stop or an obstacle. An
-    obstacle on one side lets the cart move the other way, by at least one count. A push counts only from the
-    time at which 2 m/s^2 would have moved the cart by two counts: a shorter one may move nothing.
+    obstacle on one side lets the cart move the other way, by at least two counts: one means nothing, as an open
+    wire lets the count of a moving cart change to and fro by one. A push counts only from the time at which
+    0.5 m/s^2 would have moved the cart by three counts: a shorter one may move too little.
     """
 
     def __init__(self, hardware: Hardware) -> None:
@@ -106,7 +108,7 @@ class FrozenCartWatch:
         self._count: int | None = None
         self._direction = 0  # of the present push: 1, -1, or 0 for none
         self._lasts_us = 0  # its length up to the newest count, at most PUSH_US
-        self._square = 2000 * hardware.cart_nanometres_per_count  # us^2, from which on a push counts
+        self._square = 12_000 * hardware.cart_nanometres_per_count  # us^2, from which on a push counts
         self._pushed_us = {1: 0, -1: 0}  # in each direction since the count changed, at most PUSH_US
 
     def frozen(self, cart: int, motor: int, us: int) -> bool:
@@ -114,7 +116,7 @@ class FrozenCartWatch:
         direction = 0 if abs(motor) < self._hard_push else 1 if motor > 0 else -1
         before_us = self._lasts_us if direction == self._direction else 0
         self._direction, self._lasts_us = direction, min(PUSH_US, before_us + us)
-        if cart != self._count:
+        if self._count is None or abs(cart - self._count) > 1:
             self._count, self._pushed_us = cart, {1: 0, -1: 0}
         elif direction != 0 and before_us**2 >= self._square:
             self._pushed_us[direction] = min(PUSH_US, self._pushed_us[direction] + us)
@@ -142,7 +144,7 @@ class FrozenPoleWatch:
 
     def frozen(self, pole: int, cart: int, us: int) -> bool:
         """Return whether the pole's encoder is frozen, `us` after the last counts."""
-        if pole != self._pole:
+        if self._pole is None or abs(pole - self._pole) > 1:
             self._pole, self._cart, self._elapsed_us = pole, cart, 0
             self._moved, self._lowest, self._highest, self._rise, self._fall = False, 0, 0, 0, 0
             return False
@@ -171,7 +173,7 @@ LONGEST_ROLLING_US = 3_000_000  # after the cart was armed
 SLOW_POLE = 6  # tenths of a turn a second; a faster pole may hold the cart against its motor
 PUSHED = 5_000_000  # um/s^2: a hard push speeds a common cart up so hard
 SLOWED_US = 100_000  # time constant of the estimated speed without a hard push
-LOST_NM = 20_000_000  # estimated motion without a change of the count
+LOST_NM, LOST_COUNTS = 20_000_000, 100  # the larger: estimated motion while the count stands
 FASTEST_LOST = 2_500_000  # um/s; a higher estimate comes from a count that jumped
 
 
@@ -199,6 +201,7 @@ class TrackLimits:
         self._fast_pole = hardware.pole_counts_per_turn * FAST_POLE // 10  # counts/s
         self._slow_pole = hardware.pole_counts_per_turn * SLOW_POLE // 10  # counts/s
         self._hard_push = hardware.hard_push
+        self._lost = max(LOST_NM, LOST_COUNTS * self._nanometres)
         self._braking = round(1e6 * hardware.braking)  # um/s^2
         self.blocked = 0  # direction in which motor values are held at 0
         self.brake = 0  # direction of the full motor value that brakes the cart
@@ -229,7 +232,7 @@ class TrackLimits:
         `motor` is the value in force since the last look.
         """
         us, self._looked_us = min(now_us - self._looked_us, SLOWED_US), now_us
-        if self._newest != self._count:
+        if not self._stands:
             self._count = self._newest
             self._speed_um, self._way_nm = max(-FASTEST, min(FASTEST, self._cart_speed())), 0
             return False
@@ -240,7 +243,7 @@ class TrackLimits:
         else:
             self._speed_um -= self._speed_um * us // SLOWED_US
         self._way_nm += self._speed_um * us // 1000
-        return abs(self._way_nm) >= LOST_NM
+        return abs(self._way_nm) >= self._lost
 
     def brake_blindly(self, now_us: int) -> None:
         """Brake a lost cart by its estimated speed, for 0.5 s at most. All limits were released before."""
@@ -256,7 +259,7 @@ class TrackLimits:
         The stops are `half_span` counts from the middle. Towards an end whose switch is `pressed`, the cart
         counts as being at that end or beyond: a false press never makes the way longer.
         """
-        if now_us < self._blind_us and self._newest == self._count:
+        if now_us < self._blind_us and self._stands:
             return
         self._blind_us = 0
         speed = self._cart_speed()
@@ -296,6 +299,11 @@ class TrackLimits:
     @property
     def _newest(self) -> int:
         return self._carts[-1] if self._carts else 0
+
+    @property
+    def _stands(self) -> bool:
+        """Whether the count is as before. An open wire lets that of a moving cart change to and fro by one."""
+        return self._count is not None and abs(self._newest - self._count) <= 1
 
     def _cart_speed(self) -> int:
         """Return the cart's speed in um/s, rounded down."""

@@ -7,7 +7,7 @@
 #define STALL_US 500000u
 #define STALL_COUNTS CART_COUNTS(1000)
 #define PUSH_US 100000u        /* of hard pushes one way, after which the count must have changed */
-#define PUSH_SQUARE (2000LL * CART_NANOMETRES) /* us^2, of its beginning: until 2 m/s^2 move a cart by two counts */
+#define PUSH_SQUARE (12000LL * CART_NANOMETRES) /* us^2, of its beginning: until 0.5 m/s^2 move a cart by 3 counts */
 /* In a look 0.2 m/s turn a pole as long as 1 m by two counts: 15 ms for 4096 a turn. */
 #define LOOK_US (62000000 / CART_POLE_COUNTS > CART_SHORTEST_US ? 62000000 / CART_POLE_COUNTS : CART_SHORTEST_US)
 #define ROUNDING_UM_S (4000LL * CART_NANOMETRES / LOOK_US) /* um/s: four counts of the cart in a look */
@@ -68,7 +68,7 @@ bool cart_cart_frozen(cart_frozen_cart_watch *watch, int32_t cart, int16_t motor
     int64_t before_us = direction == watch->direction ? watch->lasts_us : 0;
     watch->direction = direction;
     watch->lasts_us = (uint32_t)(before_us + period_us < PUSH_US ? before_us + period_us : PUSH_US);
-    if (!watch->counted || cart != watch->count) {
+    if (!watch->counted || cart_distance(cart, watch->count) > 1) {
         watch->counted = true;
         watch->count = cart;
         watch->right_us = watch->left_us = 0;
@@ -82,7 +82,7 @@ bool cart_cart_frozen(cart_frozen_cart_watch *watch, int32_t cart, int16_t motor
 
 bool cart_pole_frozen(cart_frozen_pole_watch *watch, int32_t pole, int32_t cart, uint32_t period_us)
 {
-    if (!watch->counted || pole != watch->pole) {
+    if (!watch->counted || cart_distance(pole, watch->pole) > 1) {
         *watch = (cart_frozen_pole_watch){.counted = true, .pole = pole, .cart = cart};
         return false;
     }

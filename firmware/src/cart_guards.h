@@ -54,10 +54,10 @@ bool cart_stalled(cart_stall_watch *watch, int32_t cart, int16_t motor, uint32_t
 bool cart_cart_jumped(cart_jump_watch *watch, int32_t cart, uint32_t period_us);
 bool cart_pole_jumped(cart_jump_watch *watch, int32_t pole, uint32_t period_us);
 
-/* A cart count that does not change under a hard push one way and then the other. */
+/* A cart count that changes by one at most, as with an open wire, under a hard push one way and then the other. */
 bool cart_cart_frozen(cart_frozen_cart_watch *watch, int32_t cart, int16_t motor, uint32_t period_us);
 
-/* A pole count that does not change while the cart speeds up by 0.2 m/s and slows down again. */
+/* A pole count that changes by one at most while the cart speeds up by 0.2 m/s and slows down again. */
 bool cart_pole_frozen(cart_frozen_pole_watch *watch, int32_t pole, int32_t cart, uint32_t period_us);
 
 #endif

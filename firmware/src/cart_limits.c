@@ -17,7 +17,7 @@
 #define SLOW_POLE (CART_POLE_COUNTS * 6LL / 10) /* counts/s; a faster pole may hold the cart against its motor */
 #define PUSHED 5000000LL /* um/s^2: a hard push speeds a common cart up so hard */
 #define SLOWED_US 100000 /* time constant of the estimated speed without a hard push */
-#define LOST_NM 20000000 /* estimated motion without a change of the count */
+#define LOST_NM (CART_NANOMETRES > 200000 ? 100 * CART_NANOMETRES : 20000000) /* estimated motion at the same count */
 #define FASTEST_LOST 2500000 /* um/s; a higher estimate comes from a count that jumped */
 
 static uint8_t oldest(const cart_limits *limits)
@@ -67,6 +67,12 @@ static int64_t within(int64_t number, int64_t largest)
     return number < -largest ? -largest : number;
 }
 
+/* A wire that is open lets the count of a moving cart change to and fro by one. */
+static bool stands(const cart_limits *limits)
+{
+    return cart_distance(limits->carts[limits->newest], limits->count) <= 1;
+}
+
 void cart_limits_forget(cart_limits *limits)
 {
     limits->counted = false;
@@ -77,7 +83,7 @@ bool cart_limits_lost(cart_limits *limits, uint64_t now_us, int16_t motor)
     uint64_t passed_us = now_us - limits->looked_us;
     int64_t us = passed_us < SLOWED_US ? (int64_t)passed_us : SLOWED_US;
     limits->looked_us = now_us;
-    if (!limits->counted || limits->carts[limits->newest] != limits->count) {
+    if (!limits->counted || !stands(limits)) {
         limits->counted = true;
         limits->count = limits->carts[limits->newest];
         limits->speed_um = within(cart_speed(limits), FASTEST);
@@ -134,7 +140,7 @@ static int8_t brake(const cart_limits *limits, int64_t speed, const cart_place *
 
 void cart_limits_apply(cart_limits *limits, uint64_t now_us, const cart_place *place)
 {
-    if (now_us < limits->blind_us && limits->carts[limits->newest] == limits->count)
+    if (now_us < limits->blind_us && stands(limits))
         return;
     limits->blind_us = 0;
     int64_t speed = cart_speed(limits);

@@ -14,10 +14,11 @@
    The brake acts while the cart is armed and after that until it has come to rest: a cart that STOP, the watchdog
    or a fault leaves at speed would roll into an end stop. It never pushes a cart that stands or moves inward.
 
-   A frozen encoder shows a cart that stands. While the count does not change, the cart's motion is estimated from
-   its last speed and, while the pole is slow, from hard pushes. After 20 mm of it the cart is lost: its encoder is
-   frozen, or something holds it. A lost cart is braked for the time that its estimated speed needs, or until its
-   count changes. Friction can hold a cart against weaker pushes: they tell nothing. */
+   A frozen encoder shows a cart that stands; one with an open wire, one whose count changes to and fro by one. While
+   the count changes by no more, the cart's motion is estimated from its last speed and, while the pole is slow, from
+   hard pushes. After 20 mm or 100 counts of it, the larger, the cart is lost: its encoder is frozen, or something holds
+   it. A lost cart is braked for the time that its estimated speed needs, or until its count changes by more. Friction
+   can hold a cart against weaker pushes: they tell nothing. */
 #ifndef CART_LIMITS_H
 #define CART_LIMITS_H
 
@@ -61,7 +62,7 @@ void cart_limits_sample(cart_limits *limits, uint64_t now_us, int32_t cart_count
 /* Start the estimate of the cart's motion anew: the cart is armed now. */
 void cart_limits_forget(cart_limits *limits);
 
-/* Does the cart's count stand still although the cart must have moved? `motor` is the value in force
+/* Does the cart's count change by one at most although the cart must have moved? `motor` is the value in force
    since the last look. */
 bool cart_limits_lost(cart_limits *limits, uint64_t now_us, int16_t motor);
 

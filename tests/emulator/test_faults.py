@@ -3,6 +3,7 @@
 import itertools
 import math
 import random
+from collections.abc import Callable
 
 import pytest
 
@@ -48,10 +49,28 @@ def test_every_boot_anywhere_is_homed():
     assert max(abs(math.remainder(angle - math.pi, 2 * math.pi)) for _, angle in places) > 1.0
 
 
-def frozen(encoder: str, motors: list[int]) -> tuple[State, float]:
+def open_wire(driven: Driven, encoder: str) -> None:
+    """Let the count of an encoder only change to and fro by one from now on."""
+    which, disc_counts = ("cart", "pole").index(encoder), driven.cart._disc_counts
+    first = disc_counts()[which]
+
+    def counts() -> tuple[int, int]:
+        now = [*disc_counts()]
+        now[which] = first + (now[which] - first) // 2 % 2
+        return now[0], now[1]
+
+    driven.cart._disc_counts = counts
+
+
+FAILURES = pytest.mark.parametrize("fail", [Driven.freeze, open_wire], ids=["frozen", "open wire"])
+
+
+def frozen(
+    encoder: str, motors: list[int], fail: Callable[[Driven, str], None] = Driven.freeze
+) -> tuple[State, float]:
     """Return the STATE with a fault and the seconds of driving since an encoder froze after homing."""
     driven = homed()
-    driven.freeze(encoder)
+    fail(driven, encoder)
     frozen_us = driven.cart.now_us
     driven.ask(Start())
     for motor in itertools.islice(itertools.cycle(motors), 100):
@@ -61,15 +80,17 @@ def frozen(encoder: str, motors: list[int]) -> tuple[State, float]:
     return state, (driven.cart.now_us - frozen_us) / 1e6
 
 
+@FAILURES
 @pytest.mark.parametrize(("encoder", "fault"), [("cart", Fault.CART_ENCODER), ("pole", Fault.POLE_ENCODER)])
-def test_a_frozen_encoder_is_detected_after_a_push_each_way(encoder, fault):
-    state, seconds = frozen(encoder, [200] * 10 + [-200] * 10)
+def test_a_frozen_encoder_is_detected_after_a_push_each_way(encoder, fault, fail):
+    state, seconds = frozen(encoder, [200] * 10 + [-200] * 10, fail)
     assert state.fault == fault
     assert seconds < 0.6
 
 
-def test_a_frozen_cart_count_is_detected_after_20_mm_of_a_hard_push():
-    state, seconds = frozen("cart", [200])
+@FAILURES
+def test_a_frozen_cart_count_is_detected_after_20_mm_of_a_hard_push(fail):
+    state, seconds = frozen("cart", [200], fail)
     assert state.fault == Fault.CART_ENCODER
     assert seconds < 0.2
 
@@ -115,9 +136,11 @@ def test_homing_after_a_lost_zero_neither_pumps_the_pole_nor_strikes_the_stops()
     assert fastest < 0.4
 
 
+@FAILURES
 @pytest.mark.parametrize(("encoder", "fault"), [("cart", Fault.HOMING), ("pole", Fault.POLE_ENCODER)])
-def test_homing_fails_with_a_frozen_encoder(encoder, fault):
-    driven = Driven(stuck_encoder=encoder)
+def test_homing_fails_with_a_frozen_encoder(encoder, fault, fail):
+    driven = Driven()
+    fail(driven, encoder)
     assert driven.home().fault == fault
     assert driven.flags == Flags.FAULTED
 

@@ -36,10 +36,10 @@ def test_short_pushes_each_way_add_up(lasts: int) -> None:
     [
         ([7] * 40, [255] * 40),
         ([7] * 40, [255, -255] * 20),
-        ([7] * 20 + [8] * 20, [255] * 20 + [-255] * 20),
+        ([7] * 20 + [9] * 20, [255] * 20 + [-255] * 20),
         ([7] * 40, [199] * 20 + [-199] * 20),
     ],
-    ids=["one way", "short pushes", "one count", "weak pushes"],
+    ids=["one way", "short pushes", "two counts", "weak pushes"],
 )
 def test_no_frozen_cart_count(counts: list[int], motors: list[int]) -> None:
     assert not any(cart_encoder_frozen(counts, motors))
@@ -60,6 +60,7 @@ FAST = round(1.1 * SPEED_CHANGE)  # um/s
 def test_a_pole_count_is_frozen_when_the_cart_speeds_up_and_slows_down() -> None:
     assert pole_encoder_frozen([0, FAST, 0], [5, 5, 5])
     assert pole_encoder_frozen([0, -FAST, 0], [5, 5, 5])
+    assert pole_encoder_frozen([0, FAST, 0], [5, 6, 5])  # an open wire
 
 
 @pytest.mark.parametrize(
@@ -67,9 +68,9 @@ def test_a_pole_count_is_frozen_when_the_cart_speeds_up_and_slows_down() -> None
     [
         ([0, FAST, FAST], [5, 5, 5]),
         ([0, 0.8 * SPEED_CHANGE, 0], [5, 5, 5]),
-        ([0, FAST, 0], [5, 6, 6]),
+        ([0, FAST, 0], [5, 7, 7]),
     ],
-    ids=["only faster", "too little", "one count"],
+    ids=["only faster", "too little", "two counts"],
 )
 def test_no_frozen_pole_count(speeds: list[float], poles: list[int]) -> None:
     assert not pole_encoder_frozen(speeds, poles)

@@ -148,12 +148,30 @@ def test_the_coarsest_encoders_are_fine_enough(period_us: int, seed: int) -> Non
     assert not faults & (Fault.CART_ENCODER | Fault.POLE_ENCODER)
 
 
+@pytest.mark.parametrize("nanometres", [300_000, 1_000_000])
+def test_a_slow_cart_with_coarse_counts_is_no_dead_encoder(nanometres: int) -> None:
+    """Hard pushes of 0.9 m/s^2 to and fro, about as long as keep the cart within three counts."""
+    rig = hardware_of(
+        {"cart_nanometres_per_count": nanometres, "motor_per_newton": 111.0, "gentle_force": 1.5}
+    )
+    driven, dice, faults = Driven(**cart_of(rig).model_dump() | {"firmware": "c"}), random.Random(1), set()
+    driven.cart.firmware.homed = True
+    driven.ask(SetPeriod(5_000))
+    driven.ask(Start())
+    longest = 3 * math.sqrt(3e-9 * nanometres)
+    for push in range(200):
+        motor = int(math.copysign(200, -driven.x)) if abs(driven.x) > 0.1 else 200 - 400 * (push % 2)
+        for _ in range(round(dice.uniform(0.3, 1.0) * longest / 0.005)):
+            faults.add(driven.ask(SetMotor(motor)).fault)
+    assert faults == {Fault.NONE}
+
+
 def test_short_pushes_within_a_coarse_count_are_no_frozen_cart() -> None:
     coarse = FrozenCartWatch(hardware_of({"cart_nanometres_per_count": 500_000}))
     motors = [200, 200, -200, -200] * 100  # 10 ms each way: 0.25 mm at 5 m/s^2
     assert not any(coarse.frozen(7, motor, 5_000) for motor in motors)
-    motors = ([200] * 30 + [-200] * 30) * 2
-    assert [coarse.frozen(7, motor, 5_000) for motor in motors].index(True) == 30 + 26
+    motors = [200] * 40 + [-200] * 40
+    assert [coarse.frozen(7, motor, 5_000) for motor in motors].index(True) == 40 + 35
 
 
 def test_a_coarse_pole_count_need_not_change_in_a_short_jerk() -> None:
