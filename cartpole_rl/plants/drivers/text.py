@@ -8,6 +8,7 @@ or has anything but finite numbers in its columns, is dropped and counted.
 """
 
 import math
+import re
 import time
 from contextlib import suppress
 from typing import TYPE_CHECKING
@@ -23,6 +24,9 @@ if TYPE_CHECKING:
     from cartpole_rl.plants.settings import TextSettings
 
 LONGEST_LINE = 200  # bytes
+FEW_LINES, QUEUED = 3, 0.1  # lines and s: so many that wait for so long are too old when they arrive
+WHOLE = re.compile(r"[+-]?[0-9]+")
+NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)(e[+-]?[0-9]+)?", re.IGNORECASE)
 LARGEST_COUNT = 2**31
 CLOCK_WRAP = 2**32  # of micros() and millis()
 MICROSECONDS = {"us": 1, "ms": 1_000, "s": 1_000_000}
@@ -43,6 +47,8 @@ class TextDriver(Driver):
         ]
         self._line: serial.SerialBase | None = None
         self._pending = b""
+        self._queued_since: float | None = None  # when lines began to wait in the system's buffer
+        self._cut = False  # the last line was perhaps sent in part
         self._clock: tuple[int, int] | None = None  # the newest time in the board's unit, and unwrapped in us
         self.port = settings.port
 
@@ -103,12 +109,30 @@ class TextDriver(Driver):
             ) from error
 
     def _write(self, text: str) -> None:
+        line, data = self._opened, text.encode() + b"\n"
         try:
-            self._opened.write(text.encode() + b"\n")
+            self._check_queue(line, FEW_LINES * len(data))
+            line.write(b"\n" + data if self._cut else data)
+            self._cut = False
         except OSError as error:
             raise LinkError(
                 f"{self.port} takes no bytes any more: {error}; is the cart unplugged?"
             ) from error
+
+    def _check_queue(self, line: "serial.SerialBase", few: int) -> None:
+        """Discard lines that have waited for long. Raises LinkError then: the newest would come too late."""
+        if getattr(line, "out_waiting", 0) <= few:  # TCP has none
+            self._queued_since = None
+            return
+        now = time.monotonic()
+        self._queued_since = self._queued_since or now
+        if now - self._queued_since > QUEUED:
+            line.reset_output_buffer()
+            self._queued_since, self._cut = None, True
+            raise LinkError(
+                f"{self.port} takes lines more slowly than they are sent: give the board and plant.baud, now "
+                f"{self.settings.baud}, a higher rate, or a longer control_period"
+            )
 
     @property
     def _opened(self) -> "serial.SerialBase":
@@ -119,7 +143,7 @@ class TextDriver(Driver):
     def _measured(self, line: bytes) -> Measurement | None:
         """Return the measurement in a line; None, and count it as bad, if it has none."""
         settings = self.settings
-        words = line.decode("ascii", errors="replace").strip().split(settings.separator)
+        words = line.decode("ascii", errors="replace").strip(" \t\r").split(settings.separator)
         if len(words) != len(settings.columns):
             self._refuse(line)
             return None
@@ -142,13 +166,13 @@ class TextDriver(Driver):
         """
         unit = MICROSECONDS[self.settings.time_unit]
         if unit == MICROSECONDS["s"]:
-            seconds = float(word)
+            seconds = float(matching(NUMBER, word))
             if not abs(seconds) < CLOCK_WRAP:
                 raise ValueError(f"{word} is not a time in s")
             return round(seconds * unit)
         if "." in word:
             raise ValueError(f"time has decimals, which plant.time_unit={self.settings.time_unit} has not")
-        ticks = int(word)
+        ticks = int(matching(WHOLE, word))
         last, us = self._clock or (ticks, ticks * unit)
         passed = (ticks - last + CLOCK_WRAP // 2) % CLOCK_WRAP - CLOCK_WRAP // 2
         self._clock = ticks, us + passed * unit
@@ -156,10 +180,18 @@ class TextDriver(Driver):
 
     def _number(self, word: str, column: str) -> float:
         """Return the number of a column. Raises ValueError."""
-        if "." in word and getattr(self.settings, f"{column}_unit") == "counts":
+        counts = getattr(self.settings, f"{column}_unit") == "counts"
+        if "." in word and counts:
             raise ValueError(f"{column} has decimals, so it is not in counts: give plant.{column}_unit")
-        return float(word)
+        return float(matching(WHOLE if counts else NUMBER, word))
 
     def _refuse(self, line: bytes, why: str = "") -> None:
         self.bad += 1
         self.why_bad = f"{line[:60]!r} is not {self.settings.separator.join(self.settings.columns)}{why}"
+
+
+def matching(pattern: re.Pattern[str], word: str) -> str:
+    """Return a word without blanks. Raises ValueError if it is not of the pattern: Python reads 1_0, too."""
+    if not pattern.fullmatch(word := word.strip(" \t")):
+        raise ValueError(f"{word} is no number")
+    return word

@@ -68,6 +68,11 @@ UNITS = {
         f"1.5,0.001,{math.pi}\n".encode(),
         Measurement(40, 2048, 1_500_000),
     ),
+    "small numbers": (
+        {"cart_unit": "m", "pole_unit": "rad"},
+        b"1,-1.0E-3,+.0\n",
+        Measurement(-40, 0, 1),
+    ),
     "other columns": (
         {"columns": ["pole", "-", "cart"], "separator": ";"},
         b"5;nonsense;6\n",
@@ -94,6 +99,10 @@ BAD = [
     b"\xff,1,2",
     b"1,2,1e30",
     b"9" * 300,
+    b"1_0,2,3",
+    b"1,2_0,3",
+    b"1,1e3,3",
+    b"1,\x1c2,3",
 ]
 
 
@@ -136,6 +145,23 @@ def test_it_sends_lines(line: Line) -> None:
         other.driver.stop()
         other.driver.home()
         assert other.sent(3) == b"a=1.23\nstop\nhome\n"
+
+
+def test_lines_that_wait_for_long_are_discarded_and_the_next_one_is_whole(
+    line: Line, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waiting = 40
+    monkeypatch.setattr(type(line.driver._line), "out_waiting", property(lambda port: waiting))
+    monkeypatch.setattr("cartpole_rl.plants.drivers.text.QUEUED", 60.0)
+    line.driver.send(1)  # so many may wait for a moment
+    monkeypatch.setattr("cartpole_rl.plants.drivers.text.QUEUED", -1.0)
+    with pytest.raises(
+        LinkError, match=r"takes lines more slowly than they are sent: .*now 115200, a higher"
+    ):
+        line.driver.send(2)
+    waiting = 0
+    line.driver.stop()
+    assert line.sent(3) == b"1\n\n0\n"
 
 
 def test_a_board_that_is_gone_is_a_lost_link(line: Line) -> None:
