@@ -124,8 +124,7 @@ class SerialCart:
             self._stop(LAST_STOP if self._stop_unanswered else LONGEST_STOP)
         except PlantError as error:
             LOGGER.warning(
-                "the cart did not confirm that it is disarmed (%s); our firmware stops it in half a second",
-                error,
+                "the cart did not confirm that it is disarmed (%s): its motor may still be on", error
             )
         except BaseException:  # a signal, before STOP was answered
             with suppress(PlantError):
