@@ -1,7 +1,9 @@
 """Carts in a process of their own: the emulated cart, and the bridge to a board. Imports no torch."""
 
 import json
+import logging
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -20,9 +22,12 @@ from cartpole_rl.plants.settings import LONGEST_WRITE, BoardSettings, SerialSett
 from cartpole_rl.rig.hardware import Hardware
 from cartpole_rl.signals import PARENT
 
+LOGGER = logging.getLogger(__name__)
+
 READY_TIMEOUT = 60.0  # s for the first line; the process loads MuJoCo before it
 ENDING = 1.0  # s that a process whose port is gone may still need
 GRACE = 3.0  # s from SIGTERM to SIGKILL
+ASKED = 1 if os.name == "nt" else -signal.SIGTERM  # exit code of a process that was not ready yet
 STDERR_BYTES = 2000  # of the end of its stderr, for an error
 
 
@@ -38,6 +43,7 @@ class CartProcess:
 
     def __init__(self, module: str, *arguments: str) -> None:
         """Start ``python -m module arguments``, and wait for its first line."""
+        self._told = False  # somebody knows why it ended
         self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 - open as long as the process
         self._process = subprocess.Popen(
             [sys.executable, "-m", module, *arguments],
@@ -79,7 +85,7 @@ class CartProcess:
         return EmulatorError(self._why(code))
 
     def close(self) -> None:
-        """End the process: SIGTERM, and SIGKILL after a grace."""
+        """End the process: SIGTERM, and SIGKILL after a grace. Warns if it failed and nobody asked why."""
         process = self._process
         if process.poll() is None:
             process.terminate()
@@ -87,7 +93,8 @@ class CartProcess:
                 process.wait(GRACE)
             except subprocess.TimeoutExpired:
                 process.kill()
-                process.wait()
+        if process.wait() not in (0, ASKED) and not self._told:
+            LOGGER.warning("%s", self._why(process.returncode))
         assert process.stdout is not None  # a pipe was asked for
         process.stdout.close()
         self._stderr.close()
@@ -124,6 +131,7 @@ class CartProcess:
             raise EmulatorError(f"{self.what}'s first line is not JSON with `port`: {line!r}") from error
 
     def _stderr_end(self) -> str:
+        self._told = True
         if self._stderr.closed:
             return "stderr is closed"
         length = self._stderr.seek(0, os.SEEK_END)
@@ -180,9 +188,12 @@ class BridgeProcess(CartProcess):
 
     def _why(self, code: int) -> str:
         if code > 0:
-            return self._stderr_end().splitlines()[-1]
+            return self._stderr_end()
         killed = "; the cart's motor may still be on: switch it off" if code < 0 else ""
         return f"{super()._why(code)}{killed}"
+
+    def _stderr_end(self) -> str:
+        return super()._stderr_end().splitlines()[-1]  # before it, a driver may have printed anything
 
     def _failed(self, code: int) -> CartPoleError:
         kind = ConfigError if code == ConfigError.exit_code else LinkError

@@ -11,10 +11,11 @@ as the board sends. docs/my-cart.md compares the two.
 
 import math
 import signal
+import sys
 import time
 from collections import deque
-from collections.abc import Generator
-from contextlib import suppress
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from itertools import pairwise
 from operator import index
@@ -25,15 +26,16 @@ from cartpole_rl.emulator.firmware import LARGEST_MOTOR, WATCHDOG_PERIODS, Firmw
 from cartpole_rl.emulator.guards import FASTEST_CART, FASTEST_POLE, LONGEST_US, SHORTEST_US
 from cartpole_rl.emulator.homing import Homing, HomingError, Reading, Window, Zeros, find_hanging
 from cartpole_rl.emulator.link import Channel
-from cartpole_rl.errors import CartPoleError, ConfigError, LinkError
+from cartpole_rl.errors import CartPoleError, ConfigError, LinkError, reason_of
 from cartpole_rl.plants.drivers.driver import Driver, Measurement
 from cartpole_rl.plants.drivers.potentiometer import Potentiometer
 from cartpole_rl.plants.settings import BoardSettings
 from cartpole_rl.rig.hardware import Hardware
 from cartpole_rl.signals import ending_signals
-from cartpole_rl.wire.messages import Fault, Message, Reason, SetPeriod, State
+from cartpole_rl.wire.messages import Fault, Home, Message, Reason, SetPeriod, State, Stop
 
 LISTENED = 25  # measurements by which a board's period is known
+FASTEST_BOARD_US = 200  # between two measurements; faster ones are milliseconds, taken for microseconds
 LISTENED_TO_ARRIVALS = 1.0  # s for a board that does not send its time
 FEW_LOST = 3  # gaps between two measurements, in medians: in longer ones the board was not heard
 PERIOD_TOLERANCE = 0.05  # share
@@ -42,6 +44,8 @@ LEAK = 0.01  # largest difference between the rates of the two clocks
 LATE_PERIODS = 1.5  # without a measurement, after which the rules look at the clock alone
 MOST_BAD = 50  # damaged measurements more than whole ones
 CONFIRMED = 3  # implausible measurements in a row that fit each other: the board counts from elsewhere now
+HUNG_PERIODS = 2  # control periods, after which a `read` that has not returned hangs
+LONGEST_CALL = 0.5  # s that a driver may take for a command
 SILENT_PERIODS = 3  # control periods without a measurement, after which the motor is off
 STOPS = 3  # lines that stop a board; the first may be damaged
 STOPPING = 2.0  # s that a cart which does not stop at the value 0 is given to stop
@@ -104,7 +108,8 @@ class StandIn(Firmware):
         """Return the measurements in a control period. Raises ConfigError if they do not make one."""
         every = max(1, round(period_us / self._board_us))
         if abs(every * self._board_us / period_us - 1) > PERIOD_TOLERANCE:
-            periods = [n * self._board_us for n in (every, every + 1)]
+            below = period_us // self._board_us
+            periods = [n * self._board_us for n in (below, below + 1)]
             fitting = " or ".join(f"{us / 1e6:.4g}" for us in periods if SHORTEST_US <= us <= LONGEST_US)
             raise ConfigError(
                 f"control_period={period_us / 1e6:g}: the board measures every {self._board_us / 1e3:.3g} "
@@ -236,7 +241,7 @@ class MotorCommands:
         self._pass_time(now)
         if self._sends == "value":
             return self._sign * wanted
-        self._acceleration = wanted - self._damping * self._speed
+        self._acceleration = max(-self._size, min(self._size, wanted - self._damping * self._speed))
         if abs(self._speed) >= self._fastest and self._speed * self._acceleration > 0:
             self._acceleration = 0.0
         return self._sign * (self._speed if self._sends == "speed" else self._acceleration)
@@ -286,6 +291,7 @@ class Bridge:
         self._channel: Channel | None = None
         self._last: Measurement | None = None
         self._arrived_us = 0  # when the last measurement came
+        self._passed_us = 0  # when the driver's `read` last returned
         self._suspects: list[Measurement] = []  # implausible ones in a row
         self._bad = self._excess = 0  # damaged measurements, and how many more than whole ones lately
         self._pole = 0  # unwrapped
@@ -316,10 +322,11 @@ class Bridge:
         self._driver.open()
         self._driver.stop()
         board_us = self._learn_period()
-        if board_us > LONGEST_US:
+        if not FASTEST_BOARD_US <= board_us <= LONGEST_US:
             raise LinkError(
-                f"{self._settings.port} measures every {board_us / 1e3:.0f} ms; a pole needs at least one "
-                f"every {LONGEST_US / 1e3:.0f} ms: let the board send more often, or check time_unit"
+                f"{self._settings.port} measures every {board_us / 1e3:.3g} ms by its time; a bridge needs "
+                f"{FASTEST_BOARD_US / 1e3:g} to {LONGEST_US / 1e3:.0f} ms: correct time_unit, or how "
+                "often it sends"
             )
         self._begin(board_us)
         if self._control_period is not None:
@@ -332,7 +339,9 @@ class Bridge:
         deadline = began + self._settings.connect_timeout + LISTENED_TO_ARRIVALS
         arrivals = False
         while len(stamps) < LISTENED or (arrivals and time.monotonic() < began + LISTENED_TO_ARRIVALS):
-            measurement = self._driver.read(max(0.0, deadline - time.monotonic()))
+            measurement = self._read(max(0.0, deadline - time.monotonic()))
+            if measurement is None and time.monotonic() < deadline:
+                continue
             if measurement is None:
                 came = f"only {len(stamps)} measurements came" if stamps else "no measurement comes"
                 raise LinkError(f"{came} from {self._settings.port}: {self._what_came()}")
@@ -353,52 +362,81 @@ class Bridge:
         period = mean(whole)  # not the median: stamps may be in whole milliseconds
         return round(sum(whole) / sum(max(1, round(gap / period)) for gap in whole))
 
+    def _read(self, timeout: float) -> Measurement | None:
+        """Return the driver's next measurement. Raises LinkError if it gives anything else."""
+        given = self._driver.read(timeout)
+        if given is None or isinstance(given, Measurement):
+            return given
+        raise LinkError(
+            f"plant.driver={self._settings.driver}: read returned {given!r}; return a Measurement, or None"
+        )
+
     def run(self, channel: Channel) -> None:
         """Pass measurements and commands on; stop the board at the end. Raises LinkError when it is lost."""
         self._channel = channel
-        self._arrived_us, self._bad = self._now_us(), self._driver.bad
-        Thread(target=self._hear, daemon=True).start()
+        self._arrived_us = self._passed_us = self._now_us()
         try:
+            self._bad = self._driver.bad
+            Thread(target=self._hear, daemon=True).start()
             while True:
-                measurement = self._driver.read(LATE_PERIODS * self._board_us * 1e-6)
-                with self._lock:
+                measurement = self._read(LATE_PERIODS * self._board_us * 1e-6)
+                with self._one_at_a_time():
                     if self._failure is not None:
                         raise self._failure
                     self._pass(measurement)
-        except (CartPoleError, OSError):
+        except CartPoleError:
             raise
-        except Exception as error:  # of a person's own driver
-            raise driver_error(error) from error
+        except Exception as error:
+            raise driver_error(self._settings, error) from error
         finally:
-            self._end()
+            self.end()
+
+    @contextmanager
+    def _one_at_a_time(self) -> Iterator[None]:
+        """Keep the other thread from the driver. Raises LinkError if it hangs in it."""
+        longest = max(LONGEST_CALL, self._settings.write_timeout)
+        if not self._lock.acquire(timeout=longest):
+            raise LinkError(
+                f"plant.driver={self._settings.driver}: send, stop or home did not return for {longest:g} s"
+            )
+        try:
+            yield
+        finally:
+            self._lock.release()
 
     def _hear(self) -> None:
         """Take the frames of the host as they come."""
         assert self._channel is not None
         try:
             while self._failure is None:
-                for frame in self._channel.receive():
-                    with self._lock:
+                frames = self._channel.receive(self._stand_in.period_us * 1e-6)
+                with self._lock:
+                    for frame in frames:
                         self._obey(frame)
-        except CartPoleError as error:
-            self._failure = error
-        except OSError as error:
-            self._failure = LinkError(f"the bridge's own port failed: {error}")
-        except Exception as error:  # of a person's own driver
-            self._failure = driver_error(error)
+                    self._stand_in_for_reader()
+        except Exception as error:
+            self._failure = driver_error(self._settings, error)
+
+    def _stand_in_for_reader(self) -> None:
+        """Apply the rules of the clock while the driver's `read` does not return."""
+        now_us = self._now_us()
+        if now_us - self._passed_us > HUNG_PERIODS * self._stand_in.period_us and self._failure is None:
+            self._wait(now_us)
 
     def _obey(self, frame: bytes | None) -> None:
         if frame is None or self._failure is not None:
             return
         before, now_us = self._stand_in.motor, self._now_us()
-        self._send(self._stand_in.receive(frame, now_us))
+        answer = self._stand_in.receive(frame, now_us)
         self._stand_in.drive(now_us)
-        if self._stand_in.motor != before:
+        if isinstance(self._stand_in.carried_out, Home | Stop) or self._stand_in.motor != before:
+            self._stops_left = STOPS  # the board may have begun to home since the last ones
             self._command()
+        self._send(answer)  # after the command: a STOP that the board did not get is not acknowledged
 
     def _pass(self, measurement: Measurement | None) -> None:
         """Pass a measurement on, or what its absence means."""
-        now_us = self._now_us()
+        now_us = self._passed_us = self._now_us()
         taken = measurement is not None and self._take(measurement, now_us)
         silent = (now_us - self._arrived_us) * 1e-6
         new_bad, self._bad = self._driver.bad - self._bad, self._driver.bad
@@ -410,9 +448,7 @@ class Bridge:
                 f"no measurement came from {self._settings.port} for {silent:.1f} s: {self._what_came()}"
             )
         if not taken:
-            self._stand_in.wait(now_us)
-            if silent > LATE_PERIODS * self._board_us * 1e-6:
-                self._command(silent=silent > SILENT_PERIODS * self._stand_in.period_us * 1e-6)
+            self._wait(now_us)
             return
         if self._measured_us > now_us + MOST_AHEAD_US:
             raise LinkError(
@@ -425,6 +461,13 @@ class Bridge:
             self._send(frames)
         self._measured = (self._measured + 1) % self._stand_in.every
         self._command()
+
+    def _wait(self, now_us: int) -> None:
+        """Apply the rules of the clock: no measurement comes."""
+        silent_us = now_us - self._arrived_us
+        self._stand_in.wait(now_us)
+        if silent_us > LATE_PERIODS * self._board_us:
+            self._command(silent=silent_us > SILENT_PERIODS * self._stand_in.period_us)
 
     def _take(self, given: Measurement, now_us: int) -> bool:
         """Note a measurement; return False for one that is implausible: damaged on the way, or repeated."""
@@ -562,19 +605,29 @@ class Bridge:
             since_us, since = self._changed_us, before
         return (new.cart - since) * self._hardware.encoders.metres / max(1, new.us - since_us) * 1e6
 
-    def _end(self) -> None:
-        """Stop the board, whatever has happened; signals wait until then."""
+    def end(self) -> None:
+        """Stop the board, whatever has happened; signals wait until then. Raises LinkError if it cannot."""
+        why = sys.exception()
+        unstopped: Exception | None = None
         for number in (signal.SIGINT, *ending_signals()):
             signal.signal(number, signal.SIG_IGN)
-        with self._lock:
-            self._failure = self._failure or LinkError("the bridge has ended")
-            with suppress(Exception):
-                self._slow_down()
-            for _ in range(STOPS):
-                with suppress(Exception):
-                    self._driver.stop()
-            with suppress(Exception):
-                self._driver.close()
+        self._lock.acquire(timeout=LONGEST_CALL)  # and not given back: nothing else may be sent
+        self._failure = self._failure or LinkError("the bridge has ended")
+        with suppress(Exception):
+            self._slow_down()
+        for _ in range(STOPS):
+            try:
+                self._driver.stop()
+                unstopped = None
+            except Exception as error:
+                unstopped = error
+        with suppress(Exception):
+            self._driver.close()
+        if unstopped is not None and self._channel is not None:  # it was driven
+            said = driver_error(self._settings, why if isinstance(why, Exception) else unstopped)
+            raise LinkError(
+                f"{said}; the board was not stopped: its motor may still be on, switch it off"
+            ) from unstopped
 
     def _slow_down(self) -> None:
         deadline, silent = time.monotonic() + STOPPING, False
@@ -585,7 +638,7 @@ class Bridge:
             self._send_value(command)
             measurement = None
             try:
-                measurement = self._driver.read(self._board_us * 1e-6)
+                measurement = self._read(self._board_us * 1e-6)
             except Exception:  # the speed then follows from what was sent
                 time.sleep(self._board_us * 1e-6)
             silent = measurement is None
@@ -608,6 +661,8 @@ class Bridge:
         return int((time.monotonic() - self._booted) * 1e6)
 
 
-def driver_error(error: Exception) -> LinkError:
-    """Return the error for one that a driver should not raise."""
-    return LinkError(f"the driver failed: {type(error).__name__}: {error}")
+def driver_error(settings: BoardSettings, error: Exception) -> CartPoleError:
+    """Return the error for one that a driver raised: itself, if it says in one line what is wrong."""
+    if isinstance(error, CartPoleError):
+        return error
+    return LinkError(f"plant.driver={settings.driver} failed: {type(error).__name__}: {reason_of(error)}")

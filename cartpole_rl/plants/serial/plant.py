@@ -290,8 +290,7 @@ class SerialPlant(OneCartPlant):
             self._connect()
         except (PortError, LinkError) as error:
             lost = f" ({self.last_error})" if self.last_error else ""
-            why = self._why_lost() or error
-            raise LinkError(f"the link to the cart was lost{lost} and not restored: {why}") from error
+            raise LinkError(f"the link to the cart was lost{lost} and not restored: {error}") from error
 
     def _why_lost(self) -> str:
         """Return the reason why the process that serves the cart has ended; empty if it has not."""
@@ -299,7 +298,12 @@ class SerialPlant(OneCartPlant):
 
     def _connect(self) -> None:
         """Open the port and check which rig the cart is. Raises PortError, LinkError, NotReadyError."""
-        self.cart.open()
+        try:
+            self.cart.open()
+        except (PortError, LinkError) as error:
+            if why := self._why_lost():
+                raise LinkError(why) from error
+            raise
         check_rig(self.cart.information, self.cart.flags, self.hardware)
 
 

@@ -25,7 +25,7 @@ from cartpole_rl.errors import ConfigError, LinkError, PlantError
 from cartpole_rl.plants.emulated import BridgeProcess
 from cartpole_rl.plants.serial.plant import SerialPlant, bridged_cart
 from cartpole_rl.plants.serial.preparation import always, nobody
-from cartpole_rl.plants.settings import TextSettings
+from cartpole_rl.plants.settings import DriverSettings, TextSettings
 from cartpole_rl.rig.hardware import Hardware, hardware_of
 
 BOARD = Path(__file__).parents[2] / "support" / "text_board.py"
@@ -229,7 +229,49 @@ def test_a_bridge_that_is_killed_says_that_the_motor_may_be_on() -> None:
         os.kill(bridge.pid, signal.SIGKILL)
         assert "exit code -9" in bridge.death()
         assert bridge.died.endswith("the cart's motor may still be on: switch it off")
-        bridge.close()
+        with pytest.raises(LinkError, match="exit code -9"):  # not that its port is gone
+            SerialPlant(TextSettings(**STEPPER, port=port).over(bridge.port), owned=bridge, hardware=RIG)
+
+
+OWN_DRIVER = """
+import time
+from cartpole_rl.plants.drivers.driver import Driver, Measurement
+
+class Talker(Driver):
+    def open(self):
+        self.read_so_far = 0
+    def read(self, timeout):
+        print("." * 10_000)  # in all, more than a pipe holds
+        time.sleep(0.01)
+        self.read_so_far += 1
+        return Measurement(0, self.read_so_far % 2, 10_000 * self.read_so_far)
+    def send(self, value):
+        pass
+    def close(self):
+        pass
+
+class Stuck(Talker):
+    def close(self):
+        time.sleep(1000)
+"""
+
+
+@pytest.mark.parametrize(("name", "warned"), [("Talker", False), ("Stuck", True)])
+def test_a_driver_may_print_and_one_that_hangs_at_the_end_is_told(
+    name: str,
+    warned: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    (tmp_path / "own_driver.py").write_text(OWN_DRIVER)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")]))
+    monkeypatch.setattr("cartpole_rl.plants.emulated.GRACE", 0.5 if warned else 30.0)
+    settings = DriverSettings(kind="driver", port="x", full=255, driver=f"own_driver:{name}")
+    with BridgeProcess(settings, RIG, None):
+        pass
+    assert ("the cart's motor may still be on: switch it off" in caplog.text) == warned
 
 
 @pytest.mark.nightly

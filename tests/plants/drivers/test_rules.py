@@ -1,10 +1,12 @@
 """The rules that a bridge keeps, with a driver that is played by the test, in its own time."""
 
 import math
+import re
 import signal
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
+from threading import Event
 from typing import Any
 
 import pytest
@@ -19,7 +21,8 @@ from cartpole_rl.plants.settings import DriverSettings
 from cartpole_rl.rig.hardware import Encoders, hardware_of
 from cartpole_rl.rig.parameters import completed
 from cartpole_rl.signals import until_stopped
-from cartpole_rl.wire.messages import Fault
+from cartpole_rl.wire.frames import encode_frame
+from cartpole_rl.wire.messages import Fault, Flags, Home, Message, Stop
 
 RIG = hardware_of(choice("cart/stepper"))  # 25 um, 4096 counts a turn
 PERIOD_US = 10_000
@@ -59,8 +62,8 @@ class Frames:
     def send(self, frame: bytes) -> None:
         pass
 
-    def receive(self) -> list[bytes]:
-        time.sleep(0.01)
+    def receive(self, timeout: float) -> list[bytes]:
+        time.sleep(timeout)
         return []
 
 
@@ -387,9 +390,60 @@ def same_signals() -> Iterator[None]:
 def test_a_driver_that_raises_anything_leaves_a_stopped_board() -> None:
     bridge = Playing(sends="acceleration", full=12.0)
     bridge.played.script = [Measurement(0, 0, 0), ValueError("oops"), ValueError("again")]
-    with pytest.raises(LinkError, match="the driver failed: ValueError: oops"):
+    with pytest.raises(LinkError, match=r"plant\.driver=.*:TextDriver failed: ValueError: oops"):
         bridge.run(Frames())  # type: ignore[arg-type]
     assert bridge.played.stops >= STOPS
+
+
+@pytest.mark.usefixtures("same_signals")
+def test_a_driver_that_returns_something_else_is_named() -> None:
+    bridge = Playing()
+    bridge.played.script = [(0, 0, 0)]
+    with pytest.raises(LinkError, match=r":TextDriver: read returned \(0, 0, 0\); return a Measurement, or"):
+        bridge.run(Frames())  # type: ignore[arg-type]
+
+
+@pytest.mark.usefixtures("same_signals")
+def test_a_read_that_does_not_return_leaves_no_motor_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    bridge, stopped = Playing(), Event()
+    bridge.measure(0, 0)
+    bridge._stand_in.armed = bridge._stand_in.homed = True
+    bridge._stand_in._line.hold(200)
+    monkeypatch.setattr(bridge, "_now_us", lambda: Bridge._now_us(bridge))
+    monkeypatch.setattr(bridge.played, "stop", stopped.set)
+
+    def hang(timeout: float) -> None:
+        raise LinkError("stopped" if stopped.wait(10) else "still on")
+
+    monkeypatch.setattr(bridge.played, "read", hang)
+    with pytest.raises(LinkError, match=r"^stopped$"):
+        bridge.run(Frames())  # type: ignore[arg-type]
+    assert bridge._stand_in.motor == 0
+
+
+@pytest.mark.usefixtures("same_signals")
+def test_a_command_that_does_not_return_keeps_nobody_from_stopping_the_board() -> None:
+    bridge = Playing()
+    bridge._lock.acquire()  # as the thread that hangs in `send`
+    with pytest.raises(LinkError, match=r":TextDriver: send, stop or home did not return for 0\.5 s"):
+        bridge.run(Frames())  # type: ignore[arg-type]
+    assert bridge.played.stops == STOPS
+
+
+@pytest.mark.usefixtures("same_signals")
+@pytest.mark.parametrize("why", ["is the cart unplugged?", ""])
+def test_a_board_that_takes_no_stop_at_the_end_is_told(why: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    bridge = Playing()
+    bridge.played.script = [LinkError(why) if why else KeyboardInterrupt()]
+    monkeypatch.setattr(bridge.played, "stop", unable)
+    with pytest.raises(
+        LinkError, match=rf"{re.escape(why or 'OSError: no bus')}; .* its motor may still be on"
+    ):
+        bridge.run(Frames())  # type: ignore[arg-type]
+
+
+def unable() -> None:
+    raise OSError("no bus")
 
 
 @pytest.mark.usefixtures("same_signals")
@@ -419,11 +473,65 @@ def test_a_board_is_stopped_before_anything_else() -> None:
     assert not bridge.played.sent
 
 
-def test_few_measurements_are_counted_in_the_message() -> None:
+def tell(bridge: Playing, *messages: Message) -> None:
+    for number, message in enumerate(messages):
+        bridge._obey(encode_frame(message, number, Flags(0)).removesuffix(b"\0"))
+
+
+def test_a_stop_right_after_home_reaches_a_board_that_homes_by_itself(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Its motor value is 0 before and after, and no measurement came between them."""
+    bridge = Playing(homing="board")
+    monkeypatch.setattr(Played, "home", lambda driver: None)
+    bridge.measure(*[0] * 10)
+    stops = bridge.played.stops
+    tell(bridge, Home(), Stop())
+    assert bridge.played.stops == stops + 1
+    bridge.measure(0, 0, 0, 0)
+    assert bridge.played.stops == stops + STOPS
+
+
+def test_a_stop_that_the_board_did_not_get_is_not_acknowledged(monkeypatch: pytest.MonkeyPatch) -> None:
+    bridge, sent = Playing(), []
+    monkeypatch.setattr(bridge, "_send", sent.append)
+    monkeypatch.setattr(bridge.played, "stop", unable)
+    with pytest.raises(OSError, match="no bus"):
+        tell(bridge, Stop())
+    assert not sent
+
+
+def test_few_measurements_are_counted_in_the_message(monkeypatch: pytest.MonkeyPatch) -> None:
     bridge = Playing(connect_timeout=0.1)
+    monkeypatch.setattr("cartpole_rl.plants.drivers.bridge.LISTENED_TO_ARRIVALS", 0.0)
     bridge.played.script = [Measurement(0, 0, PERIOD_US * number) for number in range(19)]
     with pytest.raises(LinkError, match="only 19 measurements came from x"):
         bridge.listen()
+
+
+def test_a_moment_without_a_measurement_is_no_silence() -> None:
+    bridge = Playing()
+    bridge.played.script = [
+        Measurement(0, 0, PERIOD_US * number) if number % 5 else None for number in range(60)
+    ]
+    assert bridge._learn_period() == PERIOD_US
+
+
+@pytest.mark.parametrize(("period_us", "read"), [(10, "0.01"), (10_000_000, "1e+04")])
+def test_a_time_in_another_unit_is_refused(period_us: int, read: str) -> None:
+    bridge = Playing()
+    bridge.played.script = [Measurement(0, 0, period_us * number) for number in range(25)]
+    with pytest.raises(
+        LinkError, match=rf"x measures every {re.escape(read)} ms by its time; .*correct time_unit"
+    ):
+        bridge.listen()
+
+
+def test_a_control_period_that_fits_is_named_whatever_was_asked_for() -> None:
+    bridge = Playing()
+    bridge._begin(60_000)
+    with pytest.raises(ConfigError, match=r"control_period=0\.1: .*; give control_period=0\.06$"):
+        bridge._stand_in.check_period(100_000)
 
 
 @pytest.mark.parametrize(("true_us", "unit_us"), [(1667, 1000), (3333, 1000), (10_000, 1), (16_667, 1000)])
@@ -492,6 +600,13 @@ def test_a_board_that_ignores_the_line_to_home_is_noticed() -> None:
     next(waiting)
     with pytest.raises(HomingError, match="the cart did not move"):
         deque((waiting.send(still) for _ in range(1000)), maxlen=0)
+
+
+def test_no_acceleration_exceeds_the_largest() -> None:
+    commands = MotorCommands(settings(sends="acceleration", full=-12.0, damping=20.0))
+    for speed in (0.9, -4.0):
+        commands.measured(speed, 0.0)
+        assert abs(commands.value(-255, 0.0)) <= 12
 
 
 def test_a_stepper_is_not_driven_beyond_its_fastest_speed() -> None:
