@@ -286,6 +286,8 @@ class Firmware:
                 return Reason.BUSY
             case Home() | SetPeriod() if self.armed:
                 return Reason.BUSY
+            case Home() if self._limits.brake:  # homing would end the brake
+                return Reason.BUSY
             case SetMotor() | Start() | Home() if self.fault:
                 return Reason.FAULT_LATCHED
             case Start() if not self.homed:

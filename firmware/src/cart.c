@@ -121,6 +121,8 @@ static cart_reason objection_in_this_state(const cart *self, uint8_t type)
         return CART_BUSY;
     if (self->armed && (sets || homes))
         return CART_BUSY;
+    if (self->limits.brake && homes) /* homing would end the brake */
+        return CART_BUSY;
     if (self->armed && type == CART_START_POLICY && !self->self_driven)
         return CART_BUSY;
     if (self->fault && (homes || drives))

@@ -242,13 +242,19 @@ class SerialCart:
     def _homed(self, watch: Callable[[State], None]) -> State:
         self._check_round_trip()
         before = self._tracker.last
-        try:
-            self._connection.request(Home(), Ack)
-        except RefusedError as error:
-            if error.reason != Reason.BUSY or not self._is_homing():
-                raise  # otherwise only the ACK was lost
         timeout, restarts = self.settings.home_timeout, self.restarts
         deadline = now() + timeout
+        while True:
+            try:
+                self._connection.request(Home(), Ack)
+                break
+            except RefusedError as error:
+                if error.reason != Reason.BUSY:
+                    raise
+                if self._is_homing():
+                    break  # only the ACK was lost
+                if self.flags & Flags.ARMED or now() > deadline:
+                    raise  # otherwise its brake acts, after STOP
         state = self._connection.state_since_question()
         renewed_us = (before or state).time_us
         while True:

@@ -320,6 +320,22 @@ def test_an_acknowledgement_of_home_that_comes_after_its_repetition() -> None:
         assert len(peer.messages(Home)) == 2
 
 
+def test_home_is_repeated_while_the_brake_acts() -> None:
+    class Braking(CartPeer):
+        refusals = 3
+
+        def answer(self, frame: Frame) -> Iterable[bytes]:
+            if not isinstance(frame.message, Home) or not self.refusals:
+                yield from super().answer(frame)
+                return
+            self.refusals -= 1
+            yield self.encode(Nack(frame.sequence, Home.TYPE, Reason.BUSY))
+
+    with Braking() as peer, SerialCart(quick_settings(peer.port)) as cart:
+        assert cart.home().tick
+        assert len(peer.messages(Home)) == 4
+
+
 def test_a_link_without_states_in_time_is_measured_before_the_cart_is_armed() -> None:
     """No state tells whether the cart has a clock of its own."""
 
