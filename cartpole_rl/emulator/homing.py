@@ -175,21 +175,21 @@ class Window:
         self._length_us = length_us
         self._shortest_us: int | None = None  # period so far
         self._counts: deque[int] = deque(maxlen=LONGEST_WINDOW)
-        self._full = False
+        self.full = False
 
     def add(self, count: int, us: int) -> None:
         """Add a count, `us` after the last one."""
         self._counts.append(count)
         self._shortest_us = us if self._shortest_us is None else min(us, self._shortest_us)
         length = min(LONGEST_WINDOW, -(-self._length_us // self._shortest_us) + 1)
-        self._full = len(self._counts) >= length
+        self.full = len(self._counts) >= length
         while len(self._counts) > length:
             self._counts.popleft()
 
     @property
     def spread(self) -> float:
         """Largest less smallest count; infinite until the window is full."""
-        return max(self._counts) - min(self._counts) if self._full else math.inf
+        return max(self._counts) - min(self._counts) if self.full else math.inf
 
     @property
     def centre(self) -> int:
@@ -333,12 +333,17 @@ class Homing:
         raise HomingError(f"not in the middle after {self._longest_centring / 1e6:.0f} s")
 
     def brake_swing(self, middle: int, hanging: int, reading: Reading) -> Procedure:
-        """Brake the pole's swing by moving the cart about the middle."""
+        """Brake the pole's swing by moving the cart about the middle. Raises HomingError if that pumps it."""
         brake, window, elapsed, before = SwingBrake(self._hardware), Window(WHOLE_SWING), 0, reading
+        widest = 0  # counts of the swing before the brake can have changed it much
         while elapsed < LONGEST_BRAKING:
             window.add(reading.pole, reading.us)
             if window.spread <= self._swing(BRAKED):
                 return reading
+            if window.full and elapsed < 2 * WHOLE_SWING:
+                widest = max(widest, int(window.spread))
+            if window.full and window.spread > widest + self._turn // 4:
+                raise HomingError("the pole swings ever wider: its encoder is reversed")
             if window.spread < self._turn // 4:  # the middle of such a small swing is the hanging pole
                 hanging = window.centre
             motor = brake.motor(

@@ -172,6 +172,7 @@ static void add_homing(list *all, const cart *self)
     add(all, under_way ? homing->window.used : 0);
     add(all, full ? cart_window_spread(&homing->window) : -1);
     add(all, under_way && searched ? homing->zeros.hanging : 0);
+    add(all, under_way && homing->stage == CART_BRAKE ? homing->widest : 0);
 }
 
 void cart_snapshot(const cart *self, int64_t *numbers)

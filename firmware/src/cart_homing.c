@@ -234,13 +234,18 @@ static outcome find_hanging(cart_homing *homing, const cart_reading *reading, in
 /* Brake the pole's swing by moving the cart about the middle. */
 static outcome brake_swing(cart_homing *homing, const cart_reading *reading, int16_t *motor)
 {
-    first_reading(homing, reading, WHOLE_SWING_US);
+    if (first_reading(homing, reading, WHOLE_SWING_US))
+        homing->widest = 0;
     if (homing->elapsed_us >= LONGEST_BRAKING_US)
         return ENDS;
     cart_window_add(&homing->window, reading->pole, reading->period_us);
     int64_t spread = cart_window_spread(&homing->window);
     if (spread <= BRAKED)
         return ENDS;
+    if (homing->window.full && homing->elapsed_us < 2 * WHOLE_SWING_US && spread > homing->widest)
+        homing->widest = spread;
+    if (homing->window.full && spread > homing->widest + QUARTER_TURN)
+        return FAILS; /* it pumps the swing: the pole's encoder is reversed */
     if (spread < QUARTER_TURN) /* the middle of such a small swing is the hanging pole */
         homing->zeros.hanging = cart_window_centre(&homing->window);
     int64_t swing = (int64_t)reading->pole - homing->zeros.hanging;

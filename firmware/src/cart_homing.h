@@ -53,6 +53,7 @@ typedef struct {
     double rolled;       /* m/s the wrong way then */
     cart_zeros zeros;    /* as far as they are found; before that, ends are where homing began */
     int32_t pressed_at;  /* cart count at the look that saw a switch newly pressed */
+    int64_t widest;      /* counts of the pole's swing before the brake can have changed it much */
     int64_t fastest;     /* counts/s of the pole, while the hanging count is searched */
     cart_servo servo;
     cart_window window;

@@ -107,7 +107,7 @@ def homing(firmware: Any) -> list[int]:
     """Return stage, time, servo and window of a homing that has handled a reading; else zeros."""
     stack = generators(firmware._homing)
     if len(stack) < 2:
-        return [0, 0, 0, 0, 0, -1, 0]
+        return [0, 0, 0, 0, 0, -1, 0, 0]
     stage, local = stage_of(stack), stack[-1].gi_frame.f_locals
     servo, window = local.get("servo"), local.get("window")
     return [
@@ -116,8 +116,9 @@ def homing(firmware: Any) -> list[int]:
         bits(servo._reference) if servo else 0,
         bits(servo._integral) if servo else 0,
         len(window._counts) if window else 0,
-        int(window.spread) if window and window._full else -1,
+        int(window.spread) if window and window.full else -1,
         local["hanging"] if stage in (4, 5) else 0,
+        local["widest"] if stage == 5 else 0,
     ]
 
 

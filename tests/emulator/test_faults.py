@@ -145,6 +145,23 @@ def test_homing_fails_with_a_frozen_encoder(encoder, fault, fail):
     assert driven.flags == Flags.FAULTED
 
 
+@pytest.mark.parametrize(
+    ("pole", "angle"),
+    [({}, math.pi - 1.5), ({"pole_mass": 0.233, "pole_com": 0.328, "pole_inertia": 8e-3}, math.pi - 0.3)],
+    ids=["medium", "large"],
+)
+def test_homing_does_not_go_on_pumping_the_swing_with_a_reversed_pole_encoder(pole, angle):
+    driven, touched = Driven(**pole), []
+    driven.cart.physics.place(0.05, angle)
+    driven.cart.physics.on_contact = touched.append
+    disc_counts = driven.cart._disc_counts
+    driven.cart._disc_counts = lambda: (disc_counts()[0], -disc_counts()[1])
+    assert driven.home().fault == Fault.HOMING
+    driven.tick_until(driven.cart.now_us + 2e6)
+    assert max(touched) < 0.15
+    assert driven.cart.now_us < 35e6
+
+
 @one_firmware
 @pytest.mark.parametrize(
     "settings", [{}, {"pole_mass": 0.233, "pole_com": 0.328, "pole_inertia": 8e-3}, {"start": "upright"}]
