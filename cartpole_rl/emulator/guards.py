@@ -166,6 +166,7 @@ SAMPLES = 9  # whose first and last give the speed
 REACTION_US = 10_000  # until the motor's force has changed its sign
 RELEASE_US = 10_000  # the brake is released this much later than it would be applied: it does not rattle
 REST = 10_000  # um/s; slower outward motion is not braked
+JUMPED = 5_000_000  # um/s; no cart is faster: its count has jumped
 FASTEST = 10_000_000  # um/s; a higher speed counts as this one
 FAST_POLE = 16  # tenths of a turn a second; a higher speed shakes the cart no further
 LEVER = 27_206  # um, of the medium pole on ip02: m_p l / (m_c + m_p)
@@ -278,7 +279,7 @@ class TrackLimits:
         self.blocked = self.brake = self._until_us = self._blind_us = 0
 
     def _brake(self, speed: int, outward: int, pole: int, half_span: int, pressed: int) -> int:
-        if abs(speed) < REST:
+        if not REST <= abs(speed) <= JUMPED:
             return 0
         direction = 1 if speed > 0 else -1
         fast = self._fast_pole

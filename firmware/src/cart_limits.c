@@ -9,6 +9,7 @@
 #define REACTION_US 10000 /* until the motor's force has changed its sign */
 #define RELEASE_US 10000  /* the brake is released this much later than it would be applied: it does not rattle */
 #define REST 10000        /* um/s; slower outward motion is not braked */
+#define JUMPED 5000000    /* um/s; no cart is faster: its count has jumped */
 #define FASTEST 10000000  /* um/s; a higher speed counts as this one */
 #define FAST_POLE (CART_POLE_COUNTS * 16LL / 10) /* counts/s; a higher speed shakes the cart no further */
 #define PI 3.14159265358979323846
@@ -114,7 +115,7 @@ void cart_limits_brake_blindly(cart_limits *limits, uint64_t now_us)
 
 static int8_t brake(const cart_limits *limits, int64_t speed, const cart_place *place)
 {
-    if (speed < REST && speed > -REST)
+    if ((speed < REST && speed > -REST) || speed > JUMPED || speed < -JUMPED)
         return 0;
     int8_t direction = speed > 0 ? 1 : -1;
     int64_t turning = within(speed_of(limits, limits->poles), FAST_POLE);

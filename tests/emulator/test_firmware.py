@@ -256,6 +256,17 @@ def test_a_count_that_jumps_and_then_stands_still_is_never_braked(bench):
     assert bench.firmware.motor == 0
 
 
+@pytest.mark.parametrize("cart", [8_000, -8_000])
+def test_the_brake_does_not_answer_a_jump_of_the_count(bench, cart):
+    bench.tick()
+    motors = []
+    for look in range(1, 20):
+        bench.firmware.look(bench.now_us + 1000 * look, 0 if look < 10 else cart, 2048)
+        motors.append(bench.firmware.motor)
+    assert not any(motors)
+    assert bench.tick(cart)[0].fault == Fault.CART_ENCODER
+
+
 @pytest.mark.parametrize(
     ("motors", "counts"),
     [
