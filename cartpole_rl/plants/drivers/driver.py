@@ -27,7 +27,8 @@ class Driver(ABC):
     """Reads and commands one cart.
 
     Every method may raise LinkError or OSError: the cart is lost then, and is stopped. `send`, `stop` and
-    `home` are called one at a time, also while `read` waits in another thread.
+    `home` are called one at a time, also while `read` waits in another thread. They have to return at once:
+    after 0.5 s in one of them the cart counts as lost, and `stop` is called in another thread.
     """
 
     def __init__(self, settings: "BoardSettings", encoders: "Encoders") -> None:
