@@ -18,10 +18,10 @@ watchdog or a fault leaves at speed would roll into an end stop. It never pushes
 inward.
 
 A frozen encoder shows a cart that stands; one with an open wire, one whose count changes to and fro by one.
-While the count changes by no more, the cart's motion is estimated from its last speed and, while the pole is
-slow, from hard pushes. After 20 mm or 100 counts of it, the larger, the cart is `lost`: its encoder is frozen,
-or something holds it. A lost cart is braked for the time that its estimated speed needs, or until its count
-changes by more. Friction can hold a cart against weaker pushes: they tell nothing.
+While the count changes by no more, the cart's motion is estimated from its last speed and, while the pole
+is slow, from hard pushes. After 20 mm or 100 counts of it, the larger, the cart is `lost`: its encoder is
+frozen, or something holds it. A lost cart is braked for the time that its estimated speed needs, or until
+its count changes by more. Friction can hold a cart against weaker pushes: they tell nothing.
 
 All numbers but one are whole, so that ``firmware/src/cart_guards.c`` and ``cart_limits.c`` decide the same.
 Periods are in microseconds.
@@ -97,10 +97,10 @@ class JumpWatch:
 class FrozenCartWatch:
     """Detects a cart count that does not change under hard pushes in both directions.
 
-    Under a push one way only, the cart itself may be held by a stop or an obstacle. An
-    obstacle on one side lets the cart move the other way, by at least two counts: one means nothing, as an open
-    wire lets the count of a moving cart change to and fro by one. A push counts only from the time at which
-    0.5 m/s^2 would have moved the cart by three counts: a shorter one may move too little.
+    Under a push one way only, the cart itself may be held by a stop or an obstacle. An obstacle on one side
+    lets the cart move the other way, by at least two counts: one means nothing, as an open wire lets the
+    count of a moving cart change to and fro by one. A push counts only from the time at which 0.5 m/s^2
+    would have moved the cart by three counts: a shorter one may move too little.
     """
 
     def __init__(self, hardware: Hardware) -> None:
@@ -303,7 +303,7 @@ class TrackLimits:
 
     @property
     def _stands(self) -> bool:
-        """Whether the count is as before. An open wire lets that of a moving cart change to and fro by one."""
+        """Whether the count is as before. An open wire lets that of a moving cart change by one."""
         return self._count is not None and abs(self._newest - self._count) <= 1
 
     def _cart_speed(self) -> int:
