@@ -107,7 +107,7 @@ class FrozenCartWatch:
         self._hard_push = hardware.hard_push
         self._count: int | None = None
         self._direction = 0  # of the present push: 1, -1, or 0 for none
-        self._lasts_us = 0  # its length up to the newest count, at most PUSH_US
+        self._lasts_us = 0  # its length up to the newest count, at most twice PUSH_US
         self._square = 12_000 * hardware.cart_nanometres_per_count  # us^2, from which on a push counts
         self._pushed_us = {1: 0, -1: 0}  # in each direction since the count changed, at most PUSH_US
 
@@ -115,7 +115,7 @@ class FrozenCartWatch:
         """Return whether the encoder is frozen, after `us` under `motor` that ended at count `cart`."""
         direction = 0 if abs(motor) < self._hard_push else 1 if motor > 0 else -1
         before_us = self._lasts_us if direction == self._direction else 0
-        self._direction, self._lasts_us = direction, min(PUSH_US, before_us + us)
+        self._direction, self._lasts_us = direction, min(2 * PUSH_US, before_us + us)
         if self._count is None or abs(cart - self._count) > 1:
             self._count, self._pushed_us = cart, {1: 0, -1: 0}
         elif direction != 0 and before_us**2 >= self._square:

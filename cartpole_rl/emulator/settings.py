@@ -123,7 +123,10 @@ class EmulatorSettings(Settings):
         def plus(name: str) -> float:
             return getattr(default, name) + numbers[name] - of_ip02[name]
 
-        start = zero_force_motor(numbers) / zero_force_motor(of_ip02)
+        def wide(name: str) -> float:
+            start = zero_force_motor(numbers) / zero_force_motor(of_ip02)
+            return min(LARGEST_MOTOR, max(start * getattr(default, name), numbers[name]))
+
         _, slope, constant = default.force_curve
         scaled = {
             "track_half_length": default.track_half_length
@@ -144,8 +147,8 @@ class EmulatorSettings(Settings):
                 constant * numbers["force_offset"] / of_ip02["force_offset"],
             ),
             "cart_stiction_ratio": max(1.0, times("cart_stiction_ratio")),
-            "deadband_left": min(start * default.deadband_left + numbers["deadband_left"], LARGEST_MOTOR),
-            "deadband_right": min(start * default.deadband_right + numbers["deadband_right"], LARGEST_MOTOR),
+            "deadband_left": wide("deadband_left"),
+            "deadband_right": wide("deadband_right"),
             "latency": max(0.0, plus("latency")),
             **{name: plus(name) for name in ADDED},
         }

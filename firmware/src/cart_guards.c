@@ -67,7 +67,7 @@ bool cart_cart_frozen(cart_frozen_cart_watch *watch, int32_t cart, int16_t motor
     int8_t direction = push(motor);
     int64_t before_us = direction == watch->direction ? watch->lasts_us : 0;
     watch->direction = direction;
-    watch->lasts_us = (uint32_t)(before_us + period_us < PUSH_US ? before_us + period_us : PUSH_US);
+    watch->lasts_us = (uint32_t)(before_us + period_us < 2 * PUSH_US ? before_us + period_us : 2 * PUSH_US);
     if (!watch->counted || cart_distance(cart, watch->count) > 1) {
         watch->counted = true;
         watch->count = cart;

@@ -200,14 +200,14 @@ def test_delays_tilt_and_deadband_of_the_file_are_emulated() -> None:
         "track_tilt": -0.01,
         "angle_offset": 0.03,
         "force_asymmetry": -0.1,
-        "deadband_left": 20.0,
+        "deadband_left": 70.0,
         "cart_stiction_ratio": 1.5,
     }
     cart = EmulatorSettings().of_cart(file)
     assert (cart.latency, cart.latency_jitter) == pytest.approx((0.013, 0.003))
     assert (cart.motor_time_constant, cart.track_tilt) == pytest.approx((0.025, -0.008))
     assert (cart.angle_offset, cart.force_asymmetry) == pytest.approx((0.034, -0.07))
-    assert (cart.deadband_left, cart.deadband_right, cart.cart_stiction_ratio) == (75.0, 60.0, 1.5)
+    assert (cart.deadband_left, cart.deadband_right, cart.cart_stiction_ratio) == (70.0, 60.0, 1.5)
     assert EmulatorSettings().of_cart({**file, "latency": 0.0}).latency == 0.0
     with pytest.raises(ConfigError, match=r"of cart=: emulator\.force_asymmetry=0\.91: give at most 0\.9$"):
         EmulatorSettings().of_cart({**file, "force_asymmetry": 0.88})

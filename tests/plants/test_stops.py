@@ -35,7 +35,7 @@ QUIET = 0.3  # s without a word from the cart: whoever drove it does no more
 EMULATOR = """
 import math, sys
 from pathlib import Path
-from cartpole_rl.emulator import firmware, process
+from cartpole_rl.emulator import device, firmware
 from cartpole_rl.emulator.device import CartDevice
 from cartpole_rl.emulator.homing import Zeros
 from cartpole_rl.emulator.settings import EmulatorSettings
@@ -58,9 +58,9 @@ class Centred(CartDevice):
         return answer
 
 firmware.Homing = HomingAtOnce
-process.CartDevice = Centred
+device.CartDevice = Centred
 journal = Path(sys.argv[1])
-process.run(EmulatorSettings(clock="real", cart_mass=20.0, physics_step=1e-3, journal=journal))
+device.run(EmulatorSettings(clock="real", cart_mass=20.0, physics_step=1e-3, journal=journal))
 """
 
 HOST = """

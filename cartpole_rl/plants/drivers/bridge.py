@@ -241,7 +241,8 @@ class MotorCommands:
         self._pass_time(now)
         if self._sends == "value":
             return self._sign * wanted
-        self._acceleration = max(-self._size, min(self._size, wanted - self._damping * self._speed))
+        largest = self._size + self._damping * self._fastest
+        self._acceleration = max(-largest, min(largest, wanted - self._damping * self._speed))
         if abs(self._speed) >= self._fastest and self._speed * self._acceleration > 0:
             self._acceleration = 0.0
         return self._sign * (self._speed if self._sends == "speed" else self._acceleration)
@@ -611,10 +612,11 @@ class Bridge:
         unstopped: Exception | None = None
         for number in (signal.SIGINT, *ending_signals()):
             signal.signal(number, signal.SIG_IGN)
-        self._lock.acquire(timeout=LONGEST_CALL)  # and not given back: nothing else may be sent
+        free = self._lock.acquire(timeout=LONGEST_CALL)  # and not given back: nothing else may be sent
         self._failure = self._failure or LinkError("the bridge has ended")
         with suppress(Exception):
-            self._slow_down()
+            if free:
+                self._slow_down()
         for _ in range(STOPS):
             try:
                 self._driver.stop()
@@ -631,6 +633,7 @@ class Bridge:
 
     def _slow_down(self) -> None:
         deadline, silent = time.monotonic() + STOPPING, False
+        hangs = self._now_us() - self._passed_us > HUNG_PERIODS * self._stand_in.period_us
         while time.monotonic() < deadline:
             command = self._commands.slowing(self._now_us() * 1e-6, self._stands(silent))
             if command is None:
@@ -638,6 +641,8 @@ class Bridge:
             self._send_value(command)
             measurement = None
             try:
+                if hangs:
+                    raise TimeoutError
                 measurement = self._read(self._board_us * 1e-6)
             except Exception:  # the speed then follows from what was sent
                 time.sleep(self._board_us * 1e-6)
