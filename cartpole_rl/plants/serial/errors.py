@@ -58,7 +58,7 @@ FAULTS: dict[Fault, str] = {
     Fault.POLE_ENCODER: "the pole's encoder does not answer (check its cable)",
     Fault.HOMING: "homing failed: the cart did not move, or moved the wrong way, an end stop was not found, "
     "the distance of the end stops was off by over 3 %, or the pole did not come to rest (check the motor's "
-    "supply, its direction and the cables of the motor and of the cart's encoder; clear the track, let the "
+    "supply, its direction and the cables of the motor and of both encoders; clear the track, let the "
     "pole hang)",
 }
 
