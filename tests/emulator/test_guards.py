@@ -10,7 +10,7 @@ from cartpole_rl.emulator.guards import (
     FrozenCartWatch,
     FrozenPoleWatch,
 )
-from cartpole_rl.rig.hardware import nominal_hardware
+from cartpole_rl.rig.hardware import hardware_of, nominal_hardware
 
 PERIOD = 62_500  # us
 RIG = nominal_hardware()
@@ -43,6 +43,11 @@ def test_short_pushes_each_way_add_up(lasts: int) -> None:
 )
 def test_no_frozen_cart_count(counts: list[int], motors: list[int]) -> None:
     assert not any(cart_encoder_frozen(counts, motors))
+
+
+def test_the_coarsest_rig_is_watched_too() -> None:
+    watch = FrozenCartWatch(hardware_of({"cart_nanometres_per_count": 1_000_000}))
+    assert any(watch.frozen(7, motor, 20_000) for motor in ([255] * 25 + [-255] * 25) * 2)
 
 
 def pole_encoder_frozen(speeds: list[float], poles: list[int]) -> bool:

@@ -603,10 +603,11 @@ def test_a_board_that_ignores_the_line_to_home_is_noticed() -> None:
 
 
 def test_no_acceleration_exceeds_the_largest() -> None:
+    """At the fastest speed the damping adds 20 m/s^2, as in simulation; a faster one is not a stepper's."""
     commands = MotorCommands(settings(sends="acceleration", full=-12.0, damping=20.0))
     for speed in (0.9, -4.0):
         commands.measured(speed, 0.0)
-        assert abs(commands.value(-255, 0.0)) <= 12
+        assert abs(commands.value(-255, 0.0)) <= 12 + 20
 
 
 def test_a_stepper_is_not_driven_beyond_its_fastest_speed() -> None:
