@@ -387,6 +387,9 @@ class Owned:
     closed = False
     died = ""
 
+    def death(self) -> str:
+        return ""
+
     def close(self) -> None:
         self.closed = True
 
