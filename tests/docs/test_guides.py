@@ -110,7 +110,7 @@ def made(trained: Path) -> Callable[[str], None]:
 
 def need(command: str, make: Callable[[str], None]) -> None:
     """Make the runs that `command` reads."""
-    for kind in re.findall(r"runs/(\w+)/first", command):
+    for kind in re.findall(r"runs/(\w+)(?:/first|(?= 'format))", command):
         make(kind)
 
 
@@ -129,9 +129,8 @@ def lay_out_reports(folder: Path) -> None:
 
 
 def lay_out_logs(folder: Path) -> None:
-    """Write the recordings of the identification as logs of another cart, and a file of its pole."""
+    """Write the recordings of the identification as logs of another cart."""
     (folder / "logs").mkdir()
-    (folder / "mine.yaml").write_text("defaults: [medium]\n")
     for path in (folder / "runs/identify/first/recordings").glob("*.csv"):
         episode = read_recording(path).episode
         motor = np.concatenate(([0], episode.motor)) * -4706 / 255

@@ -109,8 +109,6 @@ def counts_are_metres(runs: Runs) -> None:
     x_count, theta_count = 2 * math.pi * 0.01 / 4096, 2 * math.pi / 2000
     assert (counts[:, 0] * x_count - true.x).abs().max() < x_count  # 15.340 um is rounded
     assert (counts[:, 1] * theta_count - true.theta).abs().max() < theta_count
-    assert metrics(runs[2])["plant"] == "emulated"
-    assert metrics(runs[2])["episodes"][0]["steps"] > 5
 
 
 def agent_sees_the_energy(runs: Runs) -> None:
