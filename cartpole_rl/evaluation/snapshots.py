@@ -82,7 +82,7 @@ class Publisher:
     def __init__(self, env: "CartPoleEnv", memory: Memory, row: int = 0) -> None:
         self._env, self._memory, self._row = env, memory, row
         self._written = self._episode = 0
-        self._score = 0.0
+        self._score = self._track_half_length = 0.0
         self._ended = False
 
     def on_command(self, motor: int) -> None:
@@ -110,12 +110,12 @@ class Publisher:
         time.sleep(max(0.0, self._due - time.monotonic()))
 
     def _publish(self, step: int, motor: int, guard: int, score: float, state: Iterable[float]) -> None:
+        plant, statistics = self._env.plant, self._env.plant.statistics
         if step == 0:
             self._episode += 1
-            self._score = 0.0
+            self._score, self._track_half_length = 0.0, float(plant.track_half_length[self._row])
         self._score += score
         self._written += 1
-        plant = self._env.plant
-        present = self._episode, step, motor, guard, plant.statistics.late_ticks, plant.statistics.lost_frames
-        snapshot = (*present, *state, self._score, float(plant.track_half_length[self._row]))
+        present = self._episode, step, motor, guard, statistics.late_ticks, statistics.lost_frames
+        snapshot = (*present, *state, self._score, self._track_half_length)
         write(self._memory, self._written, Snapshot._make(snapshot))
