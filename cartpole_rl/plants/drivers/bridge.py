@@ -639,12 +639,11 @@ class Bridge:
             if command is None:
                 return
             self._send_value(command)
-            measurement = None
-            try:
-                if hangs:
-                    raise TimeoutError
-                measurement = self._read(self._board_us * 1e-6)
-            except Exception:  # the speed then follows from what was sent
+            measurement, waited = None, False
+            with suppress(Exception):  # the speed then follows from what was sent
+                if not hangs:
+                    measurement, waited = self._read(self._board_us * 1e-6), True
+            if not waited:
                 time.sleep(self._board_us * 1e-6)
             silent = measurement is None
             if measurement is not None:

@@ -385,7 +385,6 @@ def test_a_silent_cart_truncates_with_the_last_counts_and_can_come_back(
 
 class Owned:
     closed = False
-    died = ""
 
     def death(self) -> str:
         return ""
