@@ -30,12 +30,8 @@ def main(text: str) -> int:
     bridge = Bridge(settings, hardware, driver, given["control_period"], given["lever_um"])
     RaiseOnce(lambda number: KeyboardInterrupt()).handle(signal.SIGINT, *ending_signals())
     try:
-        with open_link("auto") as link:
-            try:
-                bridge.listen()
-            except BaseException:
-                bridge.end()
-                raise
+        with open_link("auto") as link, bridge:
+            bridge.listen()
             print(json.dumps({"port": link.port, "pid": os.getpid()}), file=answer, flush=True)
             take_precedence()
             bridge.run(Channel(link, EmulatorSettings(clock="real")))

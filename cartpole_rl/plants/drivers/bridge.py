@@ -11,7 +11,6 @@ as the board sends. docs/my-cart.md compares the two.
 
 import math
 import signal
-import sys
 import time
 from collections import deque
 from collections.abc import Generator, Iterator
@@ -21,6 +20,8 @@ from itertools import pairwise
 from operator import index
 from statistics import mean, median
 from threading import Lock, Thread
+from types import TracebackType
+from typing import Self
 
 from cartpole_rl.emulator.firmware import LARGEST_MOTOR, WATCHDOG_PERIODS, Firmware
 from cartpole_rl.emulator.guards import FASTEST_CART, FASTEST_POLE, LONGEST_US, SHORTEST_US
@@ -273,7 +274,7 @@ class MotorCommands:
 
 
 class Bridge:
-    """One board between its driver and the port of `channel`. `run` returns when it is interrupted."""
+    """One board between its driver and the port of a `Channel`. The end of a `with` stops the board."""
 
     def __init__(
         self,
@@ -373,7 +374,7 @@ class Bridge:
         )
 
     def run(self, channel: Channel) -> None:
-        """Pass measurements and commands on; stop the board at the end. Raises LinkError when it is lost."""
+        """Pass measurements and commands on; return only by an exception. Raises LinkError if lost."""
         self._channel = channel
         self._arrived_us = self._passed_us = self._now_us()
         try:
@@ -389,8 +390,6 @@ class Bridge:
             raise
         except Exception as error:
             raise driver_error(self._settings, error) from error
-        finally:
-            self.end()
 
     @contextmanager
     def _one_at_a_time(self) -> Iterator[None]:
@@ -606,9 +605,16 @@ class Bridge:
             since_us, since = self._changed_us, before
         return (new.cart - since) * self._hardware.encoders.metres / max(1, new.us - since_us) * 1e6
 
-    def end(self) -> None:
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        why: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
         """Stop the board, whatever has happened; signals wait until then. Raises LinkError if it cannot."""
-        why = sys.exception()
         unstopped: Exception | None = None
         for number in (signal.SIGINT, *ending_signals()):
             signal.signal(number, signal.SIG_IGN)

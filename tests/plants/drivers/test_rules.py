@@ -390,7 +390,7 @@ def same_signals() -> Iterator[None]:
 def test_a_driver_that_raises_anything_leaves_a_stopped_board() -> None:
     bridge = Playing(sends="acceleration", full=12.0)
     bridge.played.script = [Measurement(0, 0, 0), ValueError("oops"), ValueError("again")]
-    with pytest.raises(LinkError, match=r"plant\.driver=.*:TextDriver failed: ValueError: oops"):
+    with pytest.raises(LinkError, match=r"plant\.driver=.*:TextDriver failed: ValueError: oops"), bridge:
         bridge.run(Frames())  # type: ignore[arg-type]
     assert bridge.played.stops >= STOPS
 
@@ -399,7 +399,7 @@ def test_a_driver_that_raises_anything_leaves_a_stopped_board() -> None:
 def test_a_driver_that_returns_something_else_is_named() -> None:
     bridge = Playing()
     bridge.played.script = [(0, 0, 0)]
-    with pytest.raises(LinkError, match=r":TextDriver: read returned \(0, 0, 0\); return a Measurement, or"):
+    with bridge, pytest.raises(LinkError, match=r":TextDriver: read returned \(0, 0, 0\); return a Measur"):
         bridge.run(Frames())  # type: ignore[arg-type]
 
 
@@ -416,7 +416,7 @@ def test_a_read_that_does_not_return_leaves_no_motor_on(monkeypatch: pytest.Monk
         raise LinkError("stopped" if stopped.wait(10) else "still on")
 
     monkeypatch.setattr(bridge.played, "read", hang)
-    with pytest.raises(LinkError, match=r"^stopped$"):
+    with pytest.raises(LinkError, match=r"^stopped$"), bridge:
         bridge.run(Frames())  # type: ignore[arg-type]
     assert bridge._stand_in.motor == 0
 
@@ -425,7 +425,7 @@ def test_a_read_that_does_not_return_leaves_no_motor_on(monkeypatch: pytest.Monk
 def test_a_command_that_does_not_return_keeps_nobody_from_stopping_the_board() -> None:
     bridge = Playing()
     bridge._lock.acquire()  # as the thread that hangs in `send`
-    with pytest.raises(LinkError, match=r":TextDriver: send, stop or home did not return for 0\.5 s"):
+    with bridge, pytest.raises(LinkError, match=r":TextDriver: send, stop or home did not return for 0\.5 s"):
         bridge.run(Frames())  # type: ignore[arg-type]
     assert bridge.played.stops == STOPS
 
@@ -436,8 +436,11 @@ def test_a_board_that_takes_no_stop_at_the_end_is_told(why: str, monkeypatch: py
     bridge = Playing()
     bridge.played.script = [LinkError(why) if why else KeyboardInterrupt()]
     monkeypatch.setattr(bridge.played, "stop", unable)
-    with pytest.raises(
-        LinkError, match=rf"{re.escape(why or 'OSError: no bus')}; .* its motor may still be on"
+    with (
+        pytest.raises(
+            LinkError, match=rf"{re.escape(why or 'OSError: no bus')}; .* its motor may still be on"
+        ),
+        bridge,
     ):
         bridge.run(Frames())  # type: ignore[arg-type]
 
@@ -458,7 +461,7 @@ def test_two_signals_at_once_leave_a_stopped_board(monkeypatch: pytest.MonkeyPat
         signal.pthread_sigmask(signal.SIG_UNBLOCK, both)
 
     monkeypatch.setattr(bridge.played, "read", session_ends)
-    with until_stopped():
+    with until_stopped(), bridge:
         bridge.run(Frames())  # type: ignore[arg-type]
     assert bridge.played.stops == STOPS
 
