@@ -22,6 +22,7 @@ FASTEST = 5.0, 16.0  # m/s of the cart, turns/s of the pole
 PUSHED = 0.1 - 1e-6  # s of hard pushes in each direction
 SPEED_CHANGE = 0.2  # m/s up and down that turn any pole
 SUDDEN = 0.25, 0.05  # m/s, turns/s: a dead stop,
+FINE = 2000  # counts a turn: a pole that is balanced may stay within one coarser count
 STILL = 0.5  # s, if the count does not change for as long after it
 LEANING = 0.025 + 0.008  # rad: largest error of the encoder's zero, and what friction holds
 FALLEN = np.radians(10)  # rad: near enough to upright
@@ -47,7 +48,7 @@ def measured_part(episode: Episode, fault: Fault = Fault.NONE, hardware: Hardwar
     speed = np.diff(cart) * hardware.encoders.metres / gaps[:steps]
     columns = zip(("cart", "pole"), counts[: steps + 1].T, LATCHED, SUDDEN * per_unit, strict=True)
     for name, own, faults, sudden in columns:
-        last = int(np.flatnonzero(np.diff(own, prepend=own[0])).max(initial=0))  # row of the last change
+        last = last_change(own, open_wire=name == "cart" or hardware.pole_counts_per_turn >= FINE)
         if name == "cart":
             frozen = cart_froze(motor, gaps, last, hardware.hard_push) or balanced(
                 episode.theta[last : steps + 1], gaps
@@ -60,6 +61,21 @@ def measured_part(episode: Episode, fault: Fault = Fault.NONE, hardware: Hardwar
     if steps == end and fault & (Fault.CART_ENCODER | Fault.POLE_ENCODER):
         steps, why = max(0, end - 1), "a count jumped"  # lost states may hide the jump
     return episode if steps == end else _shortened(episode, steps, why)
+
+
+def last_change(count: NDArray[np.int64], open_wire: bool) -> int:
+    """Return the row of the last change of a count [K].
+
+    An encoder with an `open_wire` counts to and fro by one while it turns: that is no change.
+    """
+    steps = np.diff(count, prepend=count[0])
+    changes = np.flatnonzero(steps)
+    last = 0
+    for row in changes:
+        if abs(count[row] - count[last]) > 1:
+            last = int(row)
+    to_and_fro = {-1, 1} <= {*steps[last + 1 :].tolist()}
+    return last if open_wire and to_and_fro else int(changes.max(initial=0))
 
 
 def cart_froze(motor: NDArray[np.int64], gaps: Array, last: int, hard_push: int) -> bool:

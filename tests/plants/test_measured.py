@@ -96,6 +96,7 @@ def hanging(motor: Any, cart: Any, pole: Any) -> Episode:
     return recording(counts.astype(np.int64), gaps, motors, "time", nominal_encoders())
 
 
+COUNT = nominal_encoders().metres
 TIME = PERIOD * np.arange(100)
 FORTH_AND_BACK = 0.1 * (1 - np.cos(4 * TIME))  # m, up to 0.4 m/s
 FREE_FALL = np.rint(np.degrees(0.02 * np.cosh(6 * TIME[:26])) / 360 * 4096)
@@ -126,6 +127,8 @@ def test_what_a_whole_cart_can_do_is_kept(episode: Episode, fault: int) -> None:
     [
         (hanging(0, FORTH_AND_BACK, HANGING), 0, 0),
         (hanging(0, FORTH_AND_BACK, [HANGING - 1] * 9 + [HANGING] * 91), 0, 9),
+        (hanging(0, FORTH_AND_BACK, [*range(2043, 2048), *[HANGING, 2047] * 47, 2047]), 0, 4),  # an open wire
+        (hanging(([220] * 10 + [-220] * 10) * 4, COUNT * (np.arange(81) % 2), np.arange(81)), 0, 0),
         (hanging(([220] * 10 + [-220] * 10) * 4, [0.001] * 5 + [0.0] * 76, np.arange(81)), 0, 5),
         (hanging(100, np.zeros(100), 24 + np.arange(100) % 4), 0, 0),  # balanced by a cart that stands
         (hanging(0, np.zeros(50), [*range(2000, 2050, 5), *[2045] * 40]), 0, 9),  # in the middle of a swing
