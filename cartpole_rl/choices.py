@@ -35,6 +35,9 @@ class Chosen(NamedTuple):
     groups: Mapping[str, Any] = {}  # other groups that it chooses, as in conf/experiment/
 
 
+_FAST_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # PyYAML can lack libyaml
+
+
 class _Loader(yaml.SafeLoader):
     """YAML 1.2 for a person's file: `yes` and `1:30` are text, 1e-3 a number. A name occurs once."""
 
@@ -94,7 +97,7 @@ def _content(name: str) -> dict[str, Any]:
     if not file.is_file():
         others = sorted(other.stem for other in file.parent.glob("*.yaml"))
         raise ConfigError(f"no choice {name!r} in conf/; choose from {', '.join(others)}")
-    return yaml.safe_load(file.read_text(encoding="utf-8"))
+    return yaml.load(file.read_bytes(), _FAST_LOADER)
 
 
 def group_choices(group: str) -> dict[str, dict[str, Any]]:
