@@ -15,9 +15,9 @@ types:
 floors:
 	$(BIN)/lint-imports
 
-# three workers on two cores, since many tests wait for a cart
+# four workers on two cores, since many tests wait for a cart
 test:
-	$(BIN)/pytest -n 3 --dist worksteal --durations=20 --durations-min=5
+	$(BIN)/pytest -n 4 --dist worksteal --durations=20 --durations-min=5
 
 # what `make test` leaves out: see tests/README.md
 nightly:
