@@ -11,7 +11,7 @@ else is wrong ends the command; on a cart the motor value is 0 first.
 
 import json
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,15 +25,26 @@ from cartpole_rl.plants.specs import tensordict_of
 from cartpole_rl.registry import object_at
 
 METADATA = "cartpole_rl"  # in an ONNX file of cartpole-export: agent.json
+CHOSEN_BY = {  # what an exported agent has, and the setting that chooses it
+    "motors": "choose them by actions=",
+    "control_period": "choose it by control_period=",
+    "observation": "choose it by observation=",
+    "hardware": "choose its cart by cart=",
+}
 
 
 class OwnPolicy:
-    """The policy at `run` for the motor values `motors`. Raises ConfigError if there is none."""
+    """The policy at `run` for the motor values `motors`. Raises ConfigError if there is none.
 
-    def __init__(self, run: Path, motors: Sequence[int]) -> None:
+    `driven` are the settings that it is driven with, named as in agent.json of an exported agent.
+    """
+
+    def __init__(self, run: Path, motors: Sequence[int], driven: Mapping[str, Any] | None = None) -> None:
         self._name, self._actions = f"run={run}", len(motors)
+        expected = {"motors": [*motors], **(driven or {})}
         try:
-            self._function = onnx_function(run, motors) if run.suffix == ".onnx" else named_function(str(run))
+            onnx = run.suffix == ".onnx"
+            self._function = onnx_function(run, expected) if onnx else named_function(str(run))
         except ConfigError as error:
             raise ConfigError(f"{self._name}: {error}") from None
 
@@ -74,6 +85,17 @@ class OwnPolicy:
         return {"action": known.long(), "action_value": value}
 
 
+def differences(known: Any, wanted: Any) -> Iterator[tuple[str, str]]:
+    """Yield both values where they differ; those of a mapping one by one, with their names."""
+    if not isinstance(wanted, Mapping):
+        if known != wanted:
+            yield str(known), str(wanted)
+        return
+    for name, value in wanted.items():
+        for each in differences(known.get(name, value), value):
+            yield f"{name}={each[0]}", each[1]
+
+
 def named_function(place: str) -> Callable[[Tensor], Any]:
     """Return the function of observations at "module:name". Raises ConfigError."""
     found = object_at(place)
@@ -93,10 +115,10 @@ def named_function(place: str) -> Callable[[Tensor], Any]:
     return of_tensordict
 
 
-def onnx_function(file: Path, motors: Sequence[int]) -> Callable[[Tensor], Any]:
+def onnx_function(file: Path, expected: Mapping[str, Any]) -> Callable[[Tensor], Any]:
     """Return the first output of an ONNX file as a function of observations. Raises ConfigError.
 
-    An agent that `cartpole-export` wrote must have been trained with `motors`.
+    An agent that `cartpole-export` wrote must have been trained with what is `expected`.
     """
     try:
         import onnxruntime
@@ -108,10 +130,9 @@ def onnx_function(file: Path, motors: Sequence[int]) -> Callable[[Tensor], Any]:
         session = onnxruntime.InferenceSession(file, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # its errors have no common class
         raise ConfigError(f"it is no ONNX model: {' '.join(str(error).split())}") from None
-    known = json.loads(session.get_modelmeta().custom_metadata_map.get(METADATA, "{}")).get("motors")
-    if known is not None and [*known] != [*motors]:
-        raise ConfigError(
-            f"it was exported with the motor values {known}, not {[*motors]}; choose them by actions="
-        )
+    about = json.loads(session.get_modelmeta().custom_metadata_map.get(METADATA, "{}"))
+    for name, wanted in expected.items():
+        for known, other in differences(about.get(name, wanted), wanted):
+            raise ConfigError(f"it was exported with {name} {known}, not {other}; {CHOSEN_BY[name]}")
     name, output = session.get_inputs()[0].name, session.get_outputs()[0].name
     return lambda observation: session.run([output], {name: observation.numpy()})[0]

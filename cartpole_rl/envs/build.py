@@ -58,7 +58,8 @@ def guard_numbers(config: CartPoleSettings) -> TrackGuard:
     """Return the numbers of the track guard, fitted to the carts of `config`."""
     models = Models(config.cart_friction.model, config.pole_friction.model, config.actions.actuator)
     motors, period = config.actions.motors, config.control_period
-    return fitted_guard(config.guard.quantile, randomizer(config), motors, models, period)
+    track_end = config.nominal_cart["track_half_length"]
+    return fitted_guard(config.guard.quantile, randomizer(config), motors, models, period, track_end)
 
 
 def make_env(

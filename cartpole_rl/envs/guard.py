@@ -72,12 +72,17 @@ def guard_side(x: Number, x_dot: Number, track_end: Number | float, guard: Track
 
 
 def fitted_guard(
-    quantile: float, draws: Draws, motors: Sequence[int], models: Models, period: float
+    quantile: float,
+    draws: Draws,
+    motors: Sequence[int],
+    models: Models,
+    period: float,
+    track_end: float = LARGEST_MARGIN,
 ) -> TrackGuard:
     """Return the guard that a share `quantile` of the carts of `draws` obeys in time.
 
-    `motors` are the motor values of the agent, `period` is the control period, s. Raises ConfigError if full
-    motor does not brake the carts, or so late that they need most of the track.
+    `motors` are the motor values of the agent, `period` is the control period, s, `track_end` is half the
+    track, m. Raises ConfigError if full motor does not brake the carts, or so late that they need most of it.
     """
     if not min(motors) < 0 < max(motors):
         raise ConfigError(f"guard: actions.motors={list(motors)} brake in one direction; choose guard=none")
@@ -92,10 +97,11 @@ def fitted_guard(
     if not np.isfinite(ways).all():
         raise ConfigError("guard: full motor does not stop these carts; choose guard=none, or other actions")
     margin, delay, curvature = closest_bound(middles, ways)
-    if round(margin, 4) >= LARGEST_MARGIN:
+    largest = min(LARGEST_MARGIN, track_end)
+    if round(margin, 4) >= largest:
         raise ConfigError(
             f"guard: even from rest these carts run on by {margin:.3f} m before full motor stops them; this "
-            f"margin must be below {LARGEST_MARGIN:g} m: give a shorter control_period, less latency or "
+            f"margin must be below {largest:g} m: give a shorter control_period, less latency or "
             "smaller motor values, or guard=none"
         )
     return TrackGuard(margin=round(margin, 4), delay=round(delay, 4), deceleration=round(0.5 / curvature, 3))

@@ -193,7 +193,10 @@ def one_episode(
     columns["time"] = np.cumsum([0.0, *(frame.dt[0] for frame in frames[1:])])
     columns |= {"motor": motor, "guarded": guarded}
     episode = _episode(columns, ending, env)
-    return measured_part(episode, env.plant.fault, env.plant.hardware)
+    measured = measured_part(episode, env.plant.fault, env.plant.hardware)
+    if measured.left_out:
+        env.plant.distrust()
+    return measured
 
 
 @torch.no_grad()

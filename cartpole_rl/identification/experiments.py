@@ -29,11 +29,12 @@ import numpy as np
 from cartpole_rl.envs.guard import guard_side
 from cartpole_rl.envs.settings import LARGEST_MARGIN, TrackGuard
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.plants.measured import measured_part
+from cartpole_rl.plants.measured import BlindMotion, measured_part
 from cartpole_rl.plants.specs import Numbers, Plant, PlantOutput
 from cartpole_rl.rig.hardware import LARGEST_MOTOR, Encoders, Hardware, nominal_hardware
 from cartpole_rl.scheduling import no_garbage_collection
 from cartpole_rl.tasks.episode import Ending, Episode
+from cartpole_rl.wire.messages import Fault
 
 CLEARANCE = 0.0926  # m to the soft limit: what carts overrun that are harder to brake than assumed, and more
 LARGEST_CLEARANCE = 0.25  # of the way from the middle to the soft limit, on a short track
@@ -50,6 +51,7 @@ LONGEST_MOVE = 4.0  # s
 STANDING, LONGEST_STOP = 0.005, 3.0  # m/s, s: at the end of an experiment
 
 BROKEN_AWAY = 0.002  # m
+SURELY = 1.5  # times the breakaway motor value: it moves every cart
 RIGHT, LEFT = 1, -1
 
 
@@ -326,10 +328,12 @@ def run(
 ) -> tuple[Episode, PlantOutput[Numbers], int | None]:
     """Make the moves from the frame `present` on; return the recording, the last frame, and their result.
 
-    The recording ends where a count froze or jumped. The guard of `task` brakes the cart where the moves do
-    not. The motor is at 0 at the end, whatever the moves or the guard requested last.
+    The recording ends where a count froze or jumped; if the cart's does not show its motion, the moves end as
+    well. The guard of `task` brakes the cart where the moves do not. The motor is at 0 at the end, whatever
+    the moves or the guard requested last.
     """
     counts, gaps, motors, ended = [present.counts], [*present.dt], [], str(Ending.TIME)
+    blind, fault = BlindMotion(task.hardware, SURELY * task.breakaway), Fault.NONE
     requested, breakaway = next(moves), None
     guard, encoders = experiment_guard(task.period, task.hardware), plant.hardware.encoders
     end = track_end(task.hardware, float(plant.track_half_length))
@@ -343,6 +347,10 @@ def run(
         if present.ends:
             ended = str(plant.ended_by or Ending.TRACK)
             break
+        if blind.is_seen(motors[-1], counts[-1][0], gaps[-1]):
+            ended, fault = str(Ending.FAULT), Fault.CART_ENCODER
+            plant.halt()
+            break
         try:
             requested = moves.send(observed(counts, gaps, encoders))
         except StopIteration as result:
@@ -350,7 +358,10 @@ def run(
             present = plant.step_one(0) if motor or motors[-1] else present
             break
     recorded = recording(np.array(counts), np.array(gaps[1:]), np.array(motors), ended, encoders)
-    return measured_part(recorded, plant.fault, plant.hardware), present, breakaway
+    measured = measured_part(recorded, plant.fault | fault, plant.hardware)
+    if measured.left_out:
+        plant.distrust()
+    return measured, present, breakaway
 
 
 def observed(counts: list[Numbers], gaps: list[float], encoders: Encoders) -> Observed:

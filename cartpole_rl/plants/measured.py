@@ -7,6 +7,7 @@ stops dead, and no pole balances on a standing cart.
 """
 
 import logging
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -26,6 +27,7 @@ FINE = 2000  # counts a turn: a pole that is balanced may stay within one coarse
 STILL = 0.5  # s, if the count does not change for as long after it
 LEANING = 0.025 + 0.008  # rad: largest error of the encoder's zero, and what friction holds
 FALLEN = np.radians(10)  # rad: near enough to upright
+BLIND = 0.03  # m that a cart has moved by its file while its count stood
 HALF = 0.5  # s, over which a pole of up to 1.4 m multiplies its angle by 2.7 or more
 LATCHED = Fault.CART_ENCODER | Fault.STALL, Fault.POLE_ENCODER  # a dead cart encoder can show as a STALL
 
@@ -61,6 +63,34 @@ def measured_part(episode: Episode, fault: Fault = Fault.NONE, hardware: Hardwar
     if steps == end and fault & (Fault.CART_ENCODER | Fault.POLE_ENCODER):
         steps, why = max(0, end - 1), "a count jumped"  # lost states may hide the jump
     return episode if steps == end else _shortened(episode, steps, why)
+
+
+class BlindMotion:
+    """Notices that a cart's count stands although the motor must have moved the cart.
+
+    A cart's own rules know nothing of motor values below `hard_push`, but they can drive it into its stops.
+    """
+
+    def __init__(self, hardware: Hardware, breakaway: float) -> None:
+        """`breakaway` is a motor value that surely moves the cart from rest."""
+        self._breakaway = breakaway
+        self._acceleration = 1 / (hardware.motor_per_newton * hardware.moving_mass)  # m/s^2 a motor value
+        self._count: int | None = None
+        self._speed = self._way = 0.0  # m/s, m: estimated since the count stands
+
+    def is_seen(self, motor: int, count: int, passed: float) -> bool:
+        """Return True if the cart must have moved under its last motor values, which lasted `passed` s each.
+
+        `count` is that of the cart after them. To and fro by one is no change of it.
+        """
+        if self._count is None or abs(count - self._count) > 1:
+            self._count, self._speed, self._way = count, 0.0, 0.0
+        push = max(0.0, abs(motor) - self._breakaway)
+        self._speed += math.copysign(push, motor) * self._acceleration * passed
+        if not push:
+            self._speed = 0.0
+        self._way += self._speed * passed
+        return abs(self._way) > BLIND
 
 
 def last_change(count: NDArray[np.int64], open_wire: bool) -> int:

@@ -130,6 +130,9 @@ class Plant(EnvBase):
     def halt(self) -> None:
         """Set the motor to 0 until the next reset. Nothing moves a simulated cart that is not stepped."""
 
+    def distrust(self) -> None:
+        """Find the zeros anew in the next reset: a count froze or jumped. Simulated carts need not."""
+
     def origins(self) -> Sequence[Origin | None]:
         """Return the cart and the true state of each row, [N], right after a reset; None if unknown."""
         return [None] * self.carts

@@ -46,6 +46,7 @@ from cartpole_rl.workflows.poles import guard_holds, pole_text
 OF_BASELINE = {"observation": "raw", "observation.past_motors": 1}
 # settings that an evaluation may replace, beside the task
 REPLACEABLE = ("cart", "cart_friction", "pole_friction", "pole", "reward", "guard", "actions")
+SAME_RIG = ("pole_counts_per_turn", "cart_nanometres_per_count", "track_span")  # an exported agent's
 RECORDED = "recorded"  # in config.yaml: the settings of an agent that was recorded
 OUTDATING = {"actions": "other full motor values", "pole": "another pole"}  # a guard's numbers, in words
 
@@ -91,7 +92,12 @@ def evaluated_agent(config: EvaluateConfig) -> TrainedAgent:
     """
     if is_own_policy(config.run):
         training = own_training(config, ("observation", "actions", "control_period"), {})
-        return TrainedAgent(training, OwnPolicy(config.run, training.actions.motors))
+        driven = {
+            "control_period": training.control_period,
+            "observation": training.observation.model_dump(mode="json"),
+            "hardware": training.hardware.model_dump(include={*SAME_RIG}),
+        }
+        return TrainedAgent(training, OwnPolicy(config.run, training.actions.motors, driven))
     if config.run != BASELINE:
         return trained_agent(config.run)
     return baseline_agent(config, own_training(config, ("actions", "cart", "control_period"), OF_BASELINE))

@@ -26,11 +26,16 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 from cartpole_rl.errors import PlantError
+from cartpole_rl.plants.measured import BlindMotion
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.errors import NotReadyError, fault_error
 from cartpole_rl.rig.hardware import Hardware
 from cartpole_rl.terminal import waiting
 from cartpole_rl.wire.messages import State, seconds_between
+
+NO_MOTION = (  # the remedy for a cart whose count does not change
+    "switch the motor's supply on, check the cables of the motor and of the cart's encoder, free the cart"
+)
 
 REST_SECONDS = 0.3
 REST_COUNTS = 2  # of the cart
@@ -98,10 +103,16 @@ class ArmedCart:
         self.cart.start()
         return self.check(self.cart.get_state())
 
-    def drive(self, motor: int) -> State:
-        """Apply a motor value for one period; return the state at its end."""
+    def drive(self, motor: int, blind: BlindMotion | None = None) -> State:
+        """Apply a motor value for one period; return the state at its end.
+
+        Raises NotReadyError if `blind` finds that the cart's count does not show its motion.
+        """
         self.cart.set_motor(motor)
-        return self.check(self.cart.get_state())
+        state = self.check(self.cart.get_state())
+        if blind is not None and blind.is_seen(motor, state.cart_counts, self.period):
+            raise NotReadyError("the motor pushes, but the cart's count does not change", NO_MOTION)
+        return state
 
     def rest(self) -> State:
         """Apply motor 0 until the cart is at rest. Raises NotReadyError if it never does."""
@@ -205,12 +216,13 @@ def centre(
     """
     known = nominal_deadband(moves.hardware) if deadband is None else deadband
     controller = Centring(moves.hardware, moves.period, known, slowest)
+    blind = BlindMotion(moves.hardware, max(*known.values(), moves.hardware.breakaway_motor))
     before = moves.drive(0)
     state = moves.drive(0)
     for _ in range(moves.periods(LONGEST_CENTRING)):
         if abs(moves.metres(state.cart_counts)) < tolerance:
             return
-        before, state = state, moves.drive(controller.motor(before, state))
+        before, state = state, moves.drive(controller.motor(before, state), blind)
     raise NotReadyError(
         "the cart does not come back to the middle; it is "
         f"{moves.metres(state.cart_counts) * 1e3:+.0f} mm off",
@@ -308,6 +320,7 @@ def brake(moves: ArmedCart) -> None:
     """
     turn = moves.cart.information.pole_counts_per_turn
     braked, small, wrong, large = map(moves.pole_counts, (BRAKED, SMALL_SWING, WRONG_ZERO, LARGE_SWING))
+    blind = BlindMotion(moves.hardware, moves.hardware.breakaway_motor)
     before = moves.drive(0)
     state, poles = moves.drive(0), [before.pole_counts]
     for _ in range(moves.periods(LONGEST_BRAKING)):
@@ -322,7 +335,7 @@ def brake(moves: ArmedCart) -> None:
                     f"the pole swings about a point {off * 360 / turn:+.0f} deg from its zero",
                     "check the coupling of its encoder",
                 )
-        before, state = state, moves.drive(braking_motor(moves.hardware, before, state))
+        before, state = state, moves.drive(braking_motor(moves.hardware, before, state), blind)
     if spread(poles[-moves.periods(SWING_SECONDS) - 1 :]) > large:
         raise NotReadyError(
             f"the pole still swings far after {LONGEST_BRAKING:g} s of braking", "check the pole's encoder"

@@ -31,7 +31,7 @@ from cartpole_rl.plants.serial.preparation import (
 from cartpole_rl.plants.serial.tracking import LinkStatistics
 from cartpole_rl.plants.settings import BoardSettings, EmulatedSettings, Rehome, SerialSettings
 from cartpole_rl.plants.specs import TERMINATING, TRUNCATING, Numbers, OneCartPlant, PlantOutput, on_tensors
-from cartpole_rl.rig.hardware import Hardware, hardware_of
+from cartpole_rl.rig.hardware import LARGEST_MOTOR, Hardware, hardware_of
 from cartpole_rl.rig.parameters import completed
 from cartpole_rl.tasks.episode import Ending
 from cartpole_rl.wire.messages import Fault, Flags, State, seconds_between, ticks_between, went_back
@@ -101,6 +101,10 @@ class SerialPlant(OneCartPlant):
         self._driving = False
         with suppress(PlantError):  # the cart's watchdog does it if the link cannot
             self.cart.stop()
+
+    def distrust(self) -> None:
+        """Home in the next reset."""
+        self._preparation.require_homing()
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Set the motor to 0, disarm, give the port back, close what is owned."""
@@ -178,21 +182,33 @@ class SerialPlant(OneCartPlant):
         """Send a motor value; return the frame at the end of the period.
 
         If the cart does not acknowledge the value, or its limits changed one, what drove is what it reports:
-        the motor value in force. If its watchdog or a fault has just set the motor to 0, that was the value
-        of the period before; so it was if no value could be sent.
+        the motor value in force. Two values lasted longer than the one in force at the end: that of a brake
+        which has just let go, and the one sent if the limit has only just taken it away. If its watchdog or a
+        fault has just set the motor to 0, that was the value of the period before; so it was if no value
+        could be sent.
         """
         drove = self._drove
 
         def answer() -> State:
             nonlocal drove
             before = self.cart.flags
-            drove = self.cart.set_motor(motor)
+            sent = drove = self.cart.set_motor(motor)
             if self.on_command is not None:  # in the time until the next state
                 self.on_command(drove)
-            state = self.cart.get_state()
+            try:
+                state = self.cart.get_state()
+            except FaultError:  # it refused the value
+                drove = self._drove
+                raise
+            took = self.cart.took_motor(state)
             if self.cart.flags & Flags.SOFT_LIMIT:
                 drove = state.motor_applied
-            elif not self.cart.took_motor(state):
+                limited = before & Flags.SOFT_LIMIT
+                if took and limited and drove == sent and abs(self._drove) == LARGEST_MOTOR:
+                    drove = self._drove
+                elif took and not limited and drove == 0:
+                    drove = sent
+            elif not took:
                 has_just_stopped = state.fault or self.cart.flags & ~before & Flags.WATCHDOG
                 drove = self._drove if has_just_stopped else state.motor_applied
             return state
@@ -228,7 +244,8 @@ class SerialPlant(OneCartPlant):
             self._state = state
         except (LinkError, RefusedError, FaultError) as error:
             self._break_off(error)
-            return self._frame(self._preparation.control_period)
+            passed = seconds_between(before.time_us, self._state.time_us)
+            return self._frame(passed or self._preparation.control_period)
         self._end_if_due()
         return self._frame(seconds_between(before.time_us, self._state.time_us))
 
@@ -247,7 +264,7 @@ class SerialPlant(OneCartPlant):
             self.halt()
 
     def _break_off(self, error: PlantError) -> None:
-        """End the episode without a new state: the last counts are kept, the motor counts as 0."""
+        """End the episode: the motor counts as 0, and without a newer state the last counts are kept."""
         self.ended_by = Ending.FAULT if isinstance(error, FaultError) else Ending.LINK
         self.last_error = error
         self._driving = False
@@ -258,6 +275,11 @@ class SerialPlant(OneCartPlant):
                 self.last_error = LinkError(why)
         else:
             self.halt()
+            if isinstance(error, FaultError):
+                try:
+                    self._state = self.cart.poll_state()
+                except PlantError:
+                    self.ended_by = Ending.LINK
         self._state = replace(self._state, motor_applied=0, command_age_ms=0)
 
     def _frame(self, dt: float) -> PlantOutput[Numbers]:

@@ -17,6 +17,7 @@ from cartpole_rl.plants.serial.cart import RESTARTED, SerialCart
 from cartpole_rl.plants.serial.errors import NotReadyError, check_limits, check_period, check_rig
 from cartpole_rl.plants.serial.moves import (
     LEFT,
+    NO_MOTION,
     RIGHT,
     ArmedCart,
     centre,
@@ -35,9 +36,6 @@ RAMP_STEP = 1  # motor values per period
 SMALL_SWING = 3.5  # degrees peak to peak; pushes the cart like three motor values
 SHORT_PATIENCE = 5.0  # s
 MOVED = 0.09e-3  # m, more than a pole that swings can press into the gears' play
-NO_MOTION = (  # the remedy for a cart whose count does not change
-    "switch the motor's supply on, check the cables of the motor and of the cart's encoder, free the cart"
-)
 
 QUESTIONS = 25  # asked over the link
 LOST_SHARE = 0.05  # of the frames; a good cable loses none

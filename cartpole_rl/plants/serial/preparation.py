@@ -21,6 +21,7 @@ from cartpole_rl.wire.messages import Flags, microseconds_between
 
 LOGGER = logging.getLogger(__name__)
 
+OFF_CENTRE = 0.1  # of the half track: an episode starts no farther from the middle
 STILL_SECONDS = 0.3  # by the cart's clock, for which the pole has to stay
 
 BY_HAND = "put the cart in the middle of its track and let the pole hang still"
@@ -188,10 +189,15 @@ class Preparation:
         return True
 
     def _await_pole(self, position: PolePosition) -> None:
-        """Wait until the pole stays still in the position. Raises PlantError after `start_timeout`."""
+        """Wait until the pole stays still in the position, and the cart near the middle.
+
+        A hand that lifts the pole can move the cart. Raises PlantError after `start_timeout`.
+        """
         timeout = self._cart.settings.start_timeout
         window: deque[tuple[int, float]] = deque()  # (us, rad) of the last STILL_SECONDS
         deadline = now() + timeout
+        hardware = self._cart.hardware
+        farthest = hardware.encoders.cart_counts(OFF_CENTRE * hardware.half_span)
         while True:
             state = self._cart.poll_state()
             if not self._cart.flags & Flags.HOMED:
@@ -199,10 +205,17 @@ class Preparation:
             pole = 2 * math.pi * state.pole_counts / self._cart.information.pole_counts_per_turn
             off = math.remainder(pole - position.angle, 2 * math.pi)
             window.append((state.time_us, pole))
-            if abs(off) > position.tolerance or _spread(window) > position.sway:
+            away = abs(state.cart_counts) > farthest
+            if away or abs(off) > position.tolerance or _spread(window) > position.sway:
                 window.clear()
             elif microseconds_between(window[0][0], state.time_us) >= STILL_SECONDS * 1e6:
                 return
+            if now() > deadline and away:
+                millimetres = 1e3 * hardware.encoders.metres * state.cart_counts
+                raise PlantError(
+                    f"the cart is {millimetres:+.0f} mm from the middle of its track: bring it back by hand, "
+                    "and hold only the pole"
+                )
             if now() > deadline:
                 raise PlantError(
                     f"waited {timeout:g} s for the pole to be still within "
