@@ -1,5 +1,6 @@
 """A policy of one's own drives as a trained agent does, and what is wrong with it is one line."""
 
+import json
 import sys
 from pathlib import Path
 
@@ -112,8 +113,18 @@ def test_an_onnx_file_drives_with_its_own_motor_values(monkeypatch: pytest.Monke
     assert chosen("own.onnx") == [0, 1]
     onnx.helper.set_model_props(model, {"cartpole_rl": '{"motors": [-200, 200]}'})
     onnx.save(model, "own.onnx")
-    with pytest.raises(ConfigError, match=r"motor values \[-200, 200\], not \[-255, 255\]; choose them by"):
+    with pytest.raises(ConfigError, match=r"motors \[-200, 200\], not \[-255, 255\]; choose them by"):
         chosen("own.onnx")
+    about = {"control_period": 0.02, "hardware": {"track_span": 0.8, "moving_mass": 1.0}}
+    onnx.helper.set_model_props(model, {"cartpole_rl": json.dumps(about)})
+    onnx.save(model, "own.onnx")
+    assert OwnPolicy(Path("own.onnx"), MOTORS, {"control_period": 0.02, "hardware": {"track_span": 0.8}})
+    for driven, message in (
+        ({"control_period": 0.05}, r"control_period 0\.02, not 0\.05; choose it by control_period="),
+        ({"hardware": {"track_span": 0.6}}, r"hardware track_span=0\.8, not 0\.6; choose its cart by cart="),
+    ):
+        with pytest.raises(ConfigError, match=f"^run=own.onnx: it was exported with {message}"):
+            OwnPolicy(Path("own.onnx"), MOTORS, driven)
 
 
 def test_where_it_cannot_be_used_the_command_says_so_before_any_work() -> None:

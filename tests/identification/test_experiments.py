@@ -76,6 +76,16 @@ HANGING = StartSettings(
 )
 
 
+class SimulatedCart(OneCartPlant):
+    """A plant whose frames a test makes up."""
+
+    def _set_seed(self, seed: int | None) -> None: ...
+
+    @property
+    def track_half_length(self) -> torch.Tensor:
+        return torch.tensor([0.38])
+
+
 @pytest.fixture(scope="module")
 def recordings(make_plant: Callable[..., SimulatedPlant]) -> dict[str, Episode]:
     plant = make_plant(1, cart=TRUTH, models=MODELS, start=HANGING)
@@ -116,9 +126,7 @@ def test_every_experiment_is_made_to_its_end(recordings: dict[str, Episode]) -> 
 def test_the_last_value_sent_is_0_where_the_cart_reports_another_one() -> None:
     sent = []
 
-    class Late(OneCartPlant):
-        def _set_seed(self, seed: int | None) -> None: ...
-
+    class Late(SimulatedCart):
         def step_one(self, motor: int) -> PlantOutput[Numbers]:
             sent.append(motor)
             return at_rest
@@ -126,15 +134,40 @@ def test_the_last_value_sent_is_0_where_the_cart_reports_another_one() -> None:
         def drove(self, given: int) -> int:
             return 0
 
-        @property
-        def track_half_length(self) -> torch.Tensor:
-            return torch.tensor([0.38])
-
     at_rest = PlantOutput((0, 2048), (PERIOD,), (0,), (False,), (False,))
     task = Task.of(PERIOD, np.random.default_rng(0), nominal_hardware())
     run(Late(), at_rest, hold(220, 0.1, task), task)
     assert set(sent[:-1]) == {220}
     assert sent[-1] == 0
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS, ids=lambda each: each.name)
+def test_a_cart_whose_count_stands_is_not_pushed_into_a_stop(experiment: Experiment) -> None:
+    """Its count dithers by one, as that of an encoder with an open wire."""
+    sent: list[int] = []
+    calls: list[str] = []
+
+    class Blind(SimulatedCart):
+        def step_one(self, motor: int) -> PlantOutput[Numbers]:
+            sent.append(motor)
+            periods = len(sent)
+            return PlantOutput(
+                (-2000 + periods % 2, 2048 + periods % 9), (PERIOD,), (motor,), (False,), (False,)
+            )
+
+        def halt(self) -> None:
+            calls.append("halt")
+
+        def distrust(self) -> None:
+            calls.append("distrust")
+
+    task = Task.of(PERIOD, np.random.default_rng(0), nominal_hardware())
+    first = PlantOutput((-2000, 2048), (PERIOD,), (0,), (False,), (False,))
+    episode, *_ = run(Blind(), first, experiment.moves(task), task)
+    assert calls == ["halt", "distrust"]
+    assert episode.ended_by == "fault"
+    assert episode.steps < 5
+    assert sum(abs(motor) > 110 for motor in sent) < 50  # control periods of 20 ms
 
 
 def test_a_shorter_track_than_that_of_the_file_is_kept_to() -> None:

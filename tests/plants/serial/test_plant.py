@@ -15,7 +15,7 @@ from cartpole_rl.plants.serial.errors import NotReadyError
 from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.rig.hardware import nominal_hardware
 from cartpole_rl.wire.frames import Frame
-from cartpole_rl.wire.messages import ClearFault, Fault, Flags, Home, SetMotor, Start, Stop
+from cartpole_rl.wire.messages import ClearFault, Fault, Flags, Home, Nack, Reason, SetMotor, Start, Stop
 
 
 @pytest.fixture
@@ -139,6 +139,53 @@ def test_a_value_that_a_limit_of_the_track_replaced_did_not_drive(peer: CartPeer
     assert commanded == [200, 200]
     peer.answer, peer.flags = answer, peer.flags & ~Flags.SOFT_LIMIT
     assert driven(plant, 200) == 200
+
+
+def test_the_value_that_drove_longest_counts_where_a_limit_begins_or_ends(
+    peer: CartPeer, plant: SerialPlant
+) -> None:
+    plant.reset()
+    answer, applied = peer.answer, iter([0, -255, 200, 200])
+
+    def override(frame: Frame) -> Iterator[bytes]:
+        *answers, _ = answer(frame)
+        yield from answers
+        yield peer.next_state(motor_applied=next(applied, 0))
+
+    peer.answer, peer.flags = override, peer.flags | Flags.SOFT_LIMIT
+    assert driven(plant, 200) == 200  # the limit took it away at the end
+    assert driven(plant, 200) == -255
+    assert driven(plant, 200) == -255  # the brake let go at the end
+    peer.flags &= ~Flags.SOFT_LIMIT
+    assert driven(plant, 200) == 200
+
+
+def test_a_value_that_a_fault_refused_did_not_drive(peer: CartPeer, plant: SerialPlant) -> None:
+    """Even if the state with the fault was lost: the next one has the counts, and the time that passed."""
+    plant.reset()
+    plant.step_one(100)
+    answer = peer.answer
+
+    def refuse(frame: Frame) -> Iterator[bytes]:
+        peer.answer = answer
+        yield peer.encode(Nack(frame.sequence, frame.message.TYPE, Reason.FAULT_LATCHED))
+        yield peer.next_state(cart_counts=400)
+        peer.next_state(cart_counts=800, fault=Fault.STALL)
+
+    peer.answer = refuse
+    frame = plant.step_one(200)
+    assert plant.ended_by == "fault"
+    assert plant.fault == Fault.STALL
+    assert plant.drove(200) == 100
+    assert frame.counts[0] == 800
+    assert frame.dt[0] > 0.05
+
+
+def test_a_count_that_the_host_finds_frozen_is_homed_again(peer: CartPeer, plant: SerialPlant) -> None:
+    plant.reset()
+    plant.distrust()
+    plant.reset()
+    assert len(peer.messages(Home)) == 2
 
 
 def test_a_fault_ends_the_value_that_drove(peer: CartPeer, plant: SerialPlant) -> None:

@@ -48,6 +48,19 @@ def test_a_pole_that_is_not_there_is_waited_for_in_vain(
     plant.close()
 
 
+def test_a_cart_that_was_pushed_off_the_middle_does_not_start(peer: CartPeer) -> None:
+    """By the hand that lifts the pole. It starts once it is brought back."""
+
+    def push(text: str) -> None:
+        peer.state = replace(peer.state, pole_counts=0, cart_counts=-2000)
+
+    plant = SerialPlant(quick_settings(peer.port, start_timeout=0.05), start="upright", prompt=push)
+    with pytest.raises(PlantError, match="the cart is -45 mm from the middle of its track: bring it back by"):
+        plant.reset()
+    assert not peer.messages(Start)
+    plant.close()
+
+
 def test_a_swinging_pole_does_not_start(peer: CartPeer) -> None:
     class Swinging:
         def __init__(self) -> None:

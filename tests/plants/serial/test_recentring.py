@@ -179,12 +179,32 @@ class TestRefusals:
 
             def swinging(frame: Frame) -> Iterator[bytes]:
                 phase = math.tau * peer.state.tick / 60
-                peer.state = replace(peer.state, pole_counts=round(middle + swing * math.sin(phase)))
+                pole, cart = round(middle + swing * math.sin(phase)), round(50 * math.sin(phase))
+                peer.state = replace(peer.state, pole_counts=pole, cart_counts=cart)
                 yield from answer(frame)
 
             peer.answer = swinging
             with pytest.raises(NotReadyError, match=reason):
                 recentre(cart, HANGING)
+            assert not peer.flags & Flags.ARMED
+
+    @pytest.mark.parametrize("swing", [0, 400], ids=["centring", "braking"])
+    def test_a_count_that_stands_while_the_motor_pushes(self, swing: int) -> None:
+        """The cart itself may move: it would hit a stop."""
+        with CartPeer() as peer, SerialCart(quick(peer.port)) as cart:
+            answer, pushes = peer.answer, []
+
+            def standing(frame: Frame) -> Iterator[bytes]:
+                phase = math.tau * peer.state.tick / 60
+                pole, dither = round(HANGING + swing * math.sin(phase)), peer.state.tick % 2
+                peer.state = replace(peer.state, pole_counts=pole, cart_counts=-2000 + dither)
+                pushes.append(abs(peer.state.motor_applied) > 60)
+                yield from answer(frame)
+
+            peer.answer = standing
+            with pytest.raises(NotReadyError, match="the motor pushes, but the cart's count does not change"):
+                recentre(cart, HANGING)
+            assert sum(pushes) < 100  # control periods of 20 ms
             assert not peer.flags & Flags.ARMED
 
     def test_a_fault_on_the_way_is_answered_by_homing(self, caplog: pytest.LogCaptureFixture) -> None:
