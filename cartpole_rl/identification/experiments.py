@@ -51,7 +51,8 @@ LONGEST_MOVE = 4.0  # s
 STANDING, LONGEST_STOP = 0.005, 3.0  # m/s, s: at the end of an experiment
 
 BROKEN_AWAY = 0.002  # m
-SURELY = 1.5  # times the breakaway motor value: it moves every cart
+SURELY = 1.2, 2.2  # times the breakaway motor value, measured or by the file: it moves the cart
+GIVEN_UP = 0.5  # s after which a cart that does not move is held by friction
 RIGHT, LEFT = 1, -1
 
 
@@ -73,12 +74,18 @@ class Task(NamedTuple):
     period: float  # s, of control
     random: np.random.Generator
     breakaway: int  # motor value that moves the cart from rest
+    surely: float  # motor value that moves it if its encoder is not dead
     hardware: Hardware
 
     @classmethod
     def of(cls, period: float, random: np.random.Generator, hardware: Hardware) -> "Task":
         """Return the conditions before the cart is known."""
-        return cls(period, random, min(LARGEST_MOTOR, round(BREAKAWAY * hardware.breakaway_motor)), hardware)
+        breakaway = min(LARGEST_MOTOR, round(BREAKAWAY * hardware.breakaway_motor))
+        return cls(period, random, breakaway, SURELY[1] * hardware.breakaway_motor, hardware)
+
+    def knowing(self, breakaway: int) -> "Task":
+        """Return the conditions once the breakaway motor value is measured."""
+        return self._replace(breakaway=breakaway, surely=SURELY[0] * breakaway)
 
     @property
     def side(self) -> float:
@@ -129,9 +136,11 @@ def until_stopped(motor: int, side: int, task: Task) -> Moves:
 
 
 def go_to(target: float, task: Task) -> Moves:
-    """Bring the cart near `target` m."""
-    now = yield 0
-    for _ in range(task.periods(LONGEST_MOVE)):
+    """Bring the cart near `target` m, unless friction holds it."""
+    start = now = yield 0
+    for period in range(task.periods(LONGEST_MOVE)):
+        if period > task.periods(GIVEN_UP) and abs(now.x - start.x) < BROKEN_AWAY:
+            break
         away = target - now.x
         if abs(away) < CLOSE and abs(now.x_dot) < SLOW:
             break
@@ -226,7 +235,8 @@ def ramps(task: Task) -> Moves:
         yield from hold(0, 0.4, task)
         start = now = yield 0
         size = task.least(20)
-        while abs(now.x - start.x) < BROKEN_AWAY and size < LARGEST_MOTOR:
+        most = min(2 * needed or LARGEST_MOTOR, LARGEST_MOTOR)
+        while abs(now.x - start.x) < BROKEN_AWAY and size < most:
             size += 1
             now = yield side * size
         needed = max(needed, size)
@@ -315,7 +325,7 @@ def conduct(
             if ended:
                 present = plant.reset_one()
             recorded, present, breakaway = run(plant, present, and_stop(experiment.moves(task), task), task)
-        task = task._replace(breakaway=breakaway or task.breakaway)
+        task = task.knowing(breakaway) if breakaway else task
         ended = recorded.ended_by != Ending.TIME
         if number + 1 == len(experiments):
             plant.halt()
@@ -333,7 +343,7 @@ def run(
     the moves or the guard requested last.
     """
     counts, gaps, motors, ended = [present.counts], [*present.dt], [], str(Ending.TIME)
-    blind, fault = BlindMotion(task.hardware, SURELY * task.breakaway), Fault.NONE
+    blind, fault = BlindMotion(task.hardware, task.surely), Fault.NONE
     requested, breakaway = next(moves), None
     guard, encoders = experiment_guard(task.period, task.hardware), plant.hardware.encoders
     end = track_end(task.hardware, float(plant.track_half_length))
