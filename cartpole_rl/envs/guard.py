@@ -95,7 +95,10 @@ def fitted_guard(
     halves = [quantiles(speed[half], way[half], quantile) for half in (rightward, ~rightward)]
     middles, ways = map(np.concatenate, zip(*halves, strict=True))
     if not np.isfinite(ways).all():
-        raise ConfigError("guard: full motor does not stop these carts; choose guard=none, or other actions")
+        raise ConfigError(
+            "guard: full motor does not stop these carts; check masses (kg) and forces (N), choose other "
+            "actions, or guard=none"
+        )
     margin, delay, curvature = closest_bound(middles, ways)
     largest = min(LARGEST_MARGIN, track_end)
     if round(margin, 4) >= largest:

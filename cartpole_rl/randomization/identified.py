@@ -83,6 +83,12 @@ class IdentifiedCarts(Draws):
             found = max(found, self._longest_latency)
         return max(self.prior.highest(name), found)
 
+    def limits(self) -> dict[str, tuple[float, float]]:
+        """Return the least and the largest value of each identified parameter."""
+        flags = self._identified.squeeze(1).tolist()
+        rows = zip(CartParameters.names(), flags, self.table, strict=True)
+        return {name: (float(row.min()), float(row.max())) for name, identified, row in rows if identified}
+
     def can_differ_from_zero(self, name: str) -> bool:
         """Return whether a draw of `name` can be anything but 0."""
         row = self.table[CartParameters.names().index(name)]

@@ -63,6 +63,7 @@ class Parameter(NamedTuple):
 
 
 POSITIVE = Bound(0, math.inf, low_allowed=False)
+SMALL = Bound(0, 100, low_allowed=False)  # kg, m: a larger number has another unit
 NON_NEGATIVE = Bound(0, math.inf)
 ANY = Bound(-math.inf, math.inf)
 ASYMMETRY = Bound(-0.99, 0.99)
@@ -82,15 +83,15 @@ def add_parameter(parameter: Parameter) -> None:
 # stribeck_velocity is never unusual: below 1 mm/s it makes no difference
 # fmt: off
 for _entry in (
-    Parameter("cart_mass", "kg", POSITIVE, None, factor(0.15),
+    Parameter("cart_mass", "kg", SMALL, None, factor(0.15),
               "mass of the cart with the motor's rotor"),
-    Parameter("pole_mass", "kg", POSITIVE, None, factor(0.1),
+    Parameter("pole_mass", "kg", SMALL, None, factor(0.1),
               "mass of the pole"),
-    Parameter("pole_com", "m", POSITIVE, None, None,
+    Parameter("pole_com", "m", SMALL, None, None,
               "distance of the pole's centre of mass from the pivot, l in (3.5)"),
     Parameter("pole_inertia", "kg m^2", NON_NEGATIVE, None, factor(0.1),
               "inertia of the pole about its centre of mass"),
-    Parameter("track_half_length", "m", POSITIVE, None, None,
+    Parameter("track_half_length", "m", SMALL, None, None,
               "middle of the track to the soft limit, where an episode ends"),
     Parameter("track_tilt", "rad", SMALL_ANGLE, 0.0, Prior(0.006),
               "tilt of the track, positive: the right end is lower", mirrored=True),
@@ -187,3 +188,10 @@ def check_cart(cart: Mapping[str, float]) -> None:
             nearest = most_similar(name, [*PARAMETERS, *HARDWARE])
             raise ConfigError(f"cart.{name}: there is no such setting; did you mean cart.{nearest}?")
         check_value(name, value)
+    numbers = hardware_of(cart)
+    if cart.get("track_half_length", 0.0) > numbers.half_span:
+        most = numbers.half_span - numbers.soft_limit
+        raise ConfigError(
+            f"cart.track_half_length is {cart['track_half_length']:g} m, but half of track_span is "
+            f"{numbers.half_span:g} m; give at most {most:g} m, up to the soft limit, or mend track_span"
+        )

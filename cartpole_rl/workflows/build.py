@@ -249,8 +249,10 @@ def replaced_settings(training: TrainConfig, config: EvaluateConfig) -> CartPole
     """Return the settings of the agent's training, with those that `config` replaces. Raises ConfigError."""
     own = {name: getattr(training, name) for name in CartPoleSettings.model_fields}
     given = {name: value for name in REPLACEABLE if (value := getattr(config, name)) is not None}
-    if config.task is not None:
-        given["task"] = {**config.task.model_dump(), "x_max": config.task.x_max or training.task.x_max}
+    if config.task is not None or config.cart is not None:
+        task, track = config.task or training.task, config.cart or {"track_half_length": training.task.x_max}
+        x_max = (config.task and config.task.x_max) or track["track_half_length"]
+        given["task"] = {**task.model_dump(), "x_max": x_max}
     if config.pole is None and (own_pole := config.plant.own_pole(config.emulator, training.pole)):
         given["pole"] = own_pole
     if config.actions is not None:

@@ -18,6 +18,7 @@ from cartpole_rl.learning.agent import QAgent
 from cartpole_rl.learning.checkpoints import forget_training, load_training, restore_weights, whole_state
 from cartpole_rl.learning.states import seed_everything
 from cartpole_rl.plants.effects import without_effect
+from cartpole_rl.randomization.identified import IdentifiedCarts
 from cartpole_rl.randomization.randomizer import Draws
 from cartpole_rl.randomization.ranges import IdentifiedSettings
 from cartpole_rl.reporting.episodes import report_episodes
@@ -34,6 +35,7 @@ from cartpole_rl.workflows.config import TrainConfig, recorded_settings
 from cartpole_rl.workflows.monitor import TrainingMonitor
 from cartpole_rl.workflows.poles import emulated_words, words_of_run
 
+ROUNDING = 1e-6  # share: that of float32
 FALLEN = 0.9  # of the best score: a training that ends below it says so
 
 
@@ -148,7 +150,7 @@ def print_notes(config: TrainConfig, draws: Draws) -> None:
     if "cart" not in config.plant.ignored:
         note_other_numbers("train", config.nominal_cart, (config.pole.choices or {}).values())
     note_unused_randomization(config, draws)
-    note_other_carts(config)
+    note_other_carts(config, draws)
     if config.guard.active:
         print_message("train", f"track guard: {config.guard.active}")
 
@@ -176,17 +178,20 @@ def note_unused_randomization(config: TrainConfig, draws: Draws) -> None:
         print_message("train", f"note: randomization of {', '.join(unused)} has no effect with {chosen}")
 
 
-def note_other_carts(config: TrainConfig) -> None:
-    """Print the parameters of the nominal cart that lie outside their absolute ranges: no cart has them."""
+def note_other_carts(config: TrainConfig, draws: Draws) -> None:
+    """Print the parameters of the nominal cart that no drawn cart has: they lie outside absolute ranges."""
     nominal = config.nominal_cart
-    for name, line in config.ranges.items():
-        if line.scales_nominal or name not in nominal:
-            continue
-        low, high = line.limits()
-        if not low <= nominal[name] <= high:
+    identified = draws.limits() if isinstance(draws, IdentifiedCarts) else {}
+    lines = config.ranges.items()
+    ranges = {name: line.limits() for name, line in lines if not line.scales_nominal} | identified
+    for name, (low, high) in ranges.items():
+        value = nominal.get(name, low)
+        close = ROUNDING * abs(value)
+        if not low - close <= value <= high + close:
+            setting = "posterior" if name in identified else name
             print_message(
                 "train",
-                f"note: the cart's {name} is {nominal[name]:g}, but randomization.{name} draws {low:g} to "
+                f"note: the cart's {name} is {value:g}, but randomization.{setting} draws {low:g} to "
                 f"{high:g}: the agent is evaluated on a cart that it does not learn on; give a "
                 "randomization= that holds it (docs/randomization.md)",
             )

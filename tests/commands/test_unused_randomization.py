@@ -1,5 +1,6 @@
 """cartpole-train names the ranges that change nothing."""
 
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -39,6 +40,14 @@ def test_a_cart_outside_its_ranges_is_named(notes: Any) -> None:
         "agent is evaluated on a cart that it does not learn on; give a randomization= that holds it "
         "(docs/randomization.md)"
     )
+
+
+def test_a_number_that_no_identified_cart_has_is_named(notes: Any, tmp_path: Path) -> None:
+    (tmp_path / "carts.csv").write_text("cart_viscous,latency\n1.0,0.004\n1.2,0.006\n")
+    identified = {"randomization": {"posterior": str(tmp_path / "carts.csv"), "prior_share": 0.0}}
+    found = notes(**identified, **{"cart.cart_viscous": 2.0, "cart.latency": 0.005})
+    assert "the cart's cart_viscous is 2, but randomization.posterior draws 1 to 1.2: the agent is" in found
+    assert "latency" not in found
 
 
 def test_there_is_no_note_where_all_have_an_effect(notes: Any) -> None:

@@ -150,8 +150,8 @@ LATE = {"control_period": 0.1, "cart.latency": 0.1, "cart.latency_jitter": 0.1, 
         (LATE, r"run on by 0\.30\d m before full motor stops them; .* below 0\.3 m: give a shorter"),
         ({**LATE, "cart.track_half_length": 0.2}, r"must be below 0\.2 m: give a shorter"),
         ({"cart.cart_viscous": 1e9}, "not finite; check cart"),
-        (WEAK, "full motor does not stop these carts; choose guard=none"),
-        (WEAK_TO_ONE_SIDE, "full motor does not stop these carts; choose guard=none"),
+        (WEAK, "full motor does not stop these carts; check masses"),
+        (WEAK_TO_ONE_SIDE, "full motor does not stop these carts; check masses"),
     ],
 )
 def test_carts_that_no_guard_keeps_on_the_track_are_refused(
