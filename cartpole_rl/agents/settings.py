@@ -51,17 +51,21 @@ class AgentSettings(Settings):
     average_decay: Annotated[float, Field(gt=0, lt=1)] | None  # of the weights of the greedy policy
 
     @model_validator(mode="after")
-    def _one_way_to_move_the_target(self) -> "AgentSettings":
+    def _is_consistent(self) -> Self:
         if (self.target_tau is None) == (self.target_period is None):
             raise ValueError("give either target_tau or target_period, and null for the other")
-        return self
-
-    @model_validator(mode="after")
-    def _times_or_periods(self) -> Self:
         if self.horizon is None and self.gamma is None:
             raise ValueError("give horizon (s), or gamma (of a control period)")
         if self.action_time is None and self.action_gap is None:
             raise ValueError("give action_time (s), or action_gap (of a control period)")
+        if self.mirrored and any(size % 2 for size in self.hidden):
+            raise ValueError(f"hidden {list(self.hidden)}: a mirrored network needs even numbers of units")
+        fewest = 4 if self.mirrored else 2
+        if self.layer_norm and any(size < fewest for size in self.hidden):
+            raise ValueError(
+                f"hidden {list(self.hidden)}: layer_norm makes a single unit constant"
+                f"{', and mirrored halves the units' if self.mirrored else ''}; give at least {fewest}"
+            )
         return self
 
     @property
@@ -88,15 +92,3 @@ class AgentSettings(Settings):
         if gap is None and self.action_time is not None:
             gap = max(0.0, round(1 - control_period / self.action_time, 4))
         return self.model_copy(update={"gamma": gamma, "action_gap": gap})
-
-    @model_validator(mode="after")
-    def _halves_for_the_mirror(self) -> "AgentSettings":
-        if self.mirrored and any(size % 2 for size in self.hidden):
-            raise ValueError(f"hidden {list(self.hidden)}: a mirrored network needs even numbers of units")
-        fewest = 4 if self.mirrored else 2
-        if self.layer_norm and any(size < fewest for size in self.hidden):
-            raise ValueError(
-                f"hidden {list(self.hidden)}: layer_norm makes a single unit constant"
-                f"{', and mirrored halves the units' if self.mirrored else ''}; give at least {fewest}"
-            )
-        return self

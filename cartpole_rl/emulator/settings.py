@@ -89,13 +89,9 @@ class EmulatorSettings(Settings):
     physics_step: Annotated[float, Field(ge=1e-5, le=1e-3)] = 5e-4  # s, the longest step of the physics
 
     @model_validator(mode="after")
-    def _policy_needs_the_c_firmware(self) -> Self:
+    def _no_setting_is_without_effect(self) -> Self:
         if self.policy is not None and self.firmware != "c":
             raise ValueError("policy is C code, which the Python firmware cannot run: set firmware=c")
-        return self
-
-    @model_validator(mode="after")
-    def _stuck_at_needs_an_encoder(self) -> Self:
         if self.stuck_at > 0 and self.stuck_encoder == "none":
             raise ValueError(
                 "stuck_at has no effect without stuck_encoder: set stuck_encoder=cart or stuck_encoder=pole"

@@ -38,9 +38,6 @@ class RecordedPlant(OneCartPlant):
         """Unbounded, [1]: the recorded motor values include those of the track guard."""
         return torch.tensor([torch.inf])
 
-    def _set_seed(self, seed: int | None) -> None:
-        """Do nothing: a recording is not random."""
-
     def reset_one(self) -> PlantOutput[Numbers]:
         """Return to the first frame."""
         self._row = 0

@@ -151,7 +151,7 @@ def find_model(source: Path) -> Path:
 class EmulatedSettings(PlantSettings):
     """plant=emulated."""
 
-    place = "cartpole_rl.plants.serial.plant:emulated_cart"
+    place = "cartpole_rl.plants.serial.plant:cart_on_port"
     is_on_port = True
     reads_emulator = True
     can_be_damaged: ClassVar = False
@@ -199,6 +199,7 @@ class RealCartSettings(PlantSettings):
     Each timeout is an upper limit; a working cart answers sooner.
     """
 
+    place = "cartpole_rl.plants.serial.plant:cart_on_port"
     is_on_port = True
     can_be_damaged: ClassVar = True
     ignored = OF_SIMULATION
@@ -251,7 +252,6 @@ class RealCartSettings(PlantSettings):
 class SerialSettings(RealCartSettings):
     """Settings of a real cart with our firmware, `plant=serial`."""
 
-    place = "cartpole_rl.plants.serial.plant:real_cart"
     kind: Literal["serial"] = "serial"
     # onboard: cartpole-evaluate also lets the policy on the board drive, which is the agent of run=.
     policy: Literal["onboard"] | None = None
@@ -274,7 +274,6 @@ class SerialSettings(RealCartSettings):
 class BoardSettings(RealCartSettings):
     """A cart with firmware of its own, for which this computer stands in for ours (docs/my-cart.md)."""
 
-    place = "cartpole_rl.plants.serial.plant:bridged_cart"
     driver: Annotated[Extension, DRIVERS]
     # hand: a person puts the cart in the middle; board: its own homing; stops: this computer finds the stops.
     homing: Literal["hand", "board", "stops"] = "hand"
@@ -388,24 +387,16 @@ class TextSettings(BoardSettings):
         return line
 
     @model_validator(mode="after")
-    def _line_is_fine_enough(self) -> Self:
+    def _lines_and_columns_fit(self) -> Self:
         least = abs(self.full) / LARGEST_MOTOR
         if self.line.format(least) in (self.line.format(0.0), self.line.format(-0.0)):
             raise ValueError(
                 f"line={self.line} writes {least:.3g}, which is motor value 1, as 0: give more decimals"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _board_homes_by_a_line(self) -> Self:
         if self.homing == "board" and self.home_line is None:
             raise ValueError("homing=board needs home_line, the line that starts the board's own homing")
         if self.homing != "board" and self.home_line is not None:
             raise ValueError("home_line is for homing=board: give homing=board, or leave it out")
-        return self
-
-    @model_validator(mode="after")
-    def _a_time_has_a_column(self) -> Self:
         if "time" not in self.columns and self.time_unit != "us":
             raise ValueError("time_unit is of the column time, which columns does not name; leave it out")
         return self

@@ -216,6 +216,9 @@ class OneCartPlant(Plant):
     def __init__(self, hardware: Hardware | None = None) -> None:
         super().__init__(carts=1, hardware=hardware)
 
+    def _set_seed(self, seed: int | None) -> None:
+        """Do nothing: a real cart has its own randomness, an emulated one its own seed, a recording none."""
+
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDict:
         return self.first_output(on_tensors(self.reset_one()))
 

@@ -29,7 +29,7 @@ from cartpole_rl.plants.serial.preparation import (
     nobody,
 )
 from cartpole_rl.plants.serial.tracking import LinkStatistics
-from cartpole_rl.plants.settings import BoardSettings, EmulatedSettings, Rehome, SerialSettings
+from cartpole_rl.plants.settings import EmulatedSettings, PortSettings, Rehome, SerialSettings
 from cartpole_rl.plants.specs import TERMINATING, TRUNCATING, Numbers, OneCartPlant, PlantOutput, on_tensors
 from cartpole_rl.rig.hardware import LARGEST_MOTOR, Hardware, hardware_of
 from cartpole_rl.rig.parameters import completed
@@ -138,9 +138,6 @@ class SerialPlant(OneCartPlant):
     def track_half_length(self) -> Tensor:
         """m, [1]: the soft limit of the cart, from the span that it measured in homing."""
         return torch.tensor([self.cart.information.soft_limit_counts * self.hardware.encoders.metres])
-
-    def _set_seed(self, seed: int | None) -> None:
-        """Do nothing: a real cart has its own randomness, an emulated one has its seed in its settings."""
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDict:
         if tensordict is not None and "_reset" in tensordict and not tensordict["_reset"].any():
@@ -329,68 +326,37 @@ class SerialPlant(OneCartPlant):
         check_rig(self.cart.information, self.cart.flags, self.hardware)
 
 
-def real_cart(
-    plant: SerialSettings,
+def cart_on_port(
+    plant: PortSettings,
     emulator: EmulatorSettings,
     control_period: float,
     start: StartPosition,
     prompt: Callable[[str], None],
-    confirm: Confirm = nobody,
-    cart: Mapping[str, float] | None = None,
+    confirm: Confirm,
+    cart: Mapping[str, float],
 ) -> SerialPlant:
-    """Return the plant of plant=serial; `cart` is its file. Raises PortError, LinkError, NotReadyError."""
-    hardware = hardware_of(cart or {})
-    return SerialPlant(plant, start, control_period, prompt, confirm=confirm, hardware=hardware)
+    """Return the plant of the settings `plant`, whose cart has the numbers `cart`.
 
+    plant=emulated makes a new cart with the settings `emulator` and the start `start`, which needs nobody to
+    confirm. The bridge of plant=text and plant=driver lives as long as the plant; its brake knows the pole if
+    `cart` has the numbers of one.
 
-def bridged_cart(
-    plant: BoardSettings,
-    emulator: EmulatorSettings,
-    control_period: float,
-    start: StartPosition,
-    prompt: Callable[[str], None],
-    confirm: Confirm = nobody,
-    cart: Mapping[str, float] | None = None,
-) -> SerialPlant:
-    """Return the plant of plant=text and plant=driver, on a bridge that lives as long as the plant.
-
-    The brake knows the pole by the numbers of `cart`, if they include a pole's.
-
-    Raises ConfigError if the board does not measure as often as the period needs, PortError, LinkError.
+    Raises PortError, LinkError, NotReadyError, EmulatorError; ConfigError if an emulated cart has another
+    start, or a board does not measure as often as the period needs.
     """
-    hardware, numbers = hardware_of(cart or {}), completed(cart or {})
+    if isinstance(plant, EmulatedSettings):
+        if emulator.start not in ("hanging", start):
+            raise ConfigError(f"emulator.start={emulator.start}: this cart starts {start}; leave it out")
+        emulator = emulator.of_cart(cart).model_copy(update={"start": start})
+        return emulated_plant(emulator, control_period, prompt, plant.rehome)
+    hardware = hardware_of(cart)
+    if isinstance(plant, SerialSettings):
+        return SerialPlant(plant, start, control_period, prompt, confirm=confirm, hardware=hardware)
+    numbers = completed(cart)
     lever = lever_um(numbers) if {"cart_mass", "pole_mass", "pole_com"} <= numbers.keys() else LEVER
     bridge = BridgeProcess(plant, hardware, control_period, lever)
-    return SerialPlant(
-        plant.over(bridge.port),
-        start,
-        control_period,
-        prompt,
-        bridge,
-        confirm,
-        hardware,
-        asking(plant, confirm),
-    )
-
-
-def emulated_cart(
-    plant: EmulatedSettings,
-    emulator: EmulatorSettings,
-    control_period: float,
-    start: StartPosition,
-    prompt: Callable[[str], None],
-    confirm: Confirm = nobody,
-    cart: Mapping[str, float] | None = None,
-) -> SerialPlant:
-    """Return the plant of plant=emulated, on a new cart with the settings `emulator` and the start `start`.
-
-    It needs nobody to confirm. Raises PortError, LinkError, NotReadyError, EmulatorError, ConfigError.
-    """
-    if emulator.start not in ("hanging", start):
-        raise ConfigError(f"emulator.start={emulator.start}: this cart starts {start}; leave it out")
-    if cart is not None:
-        emulator = emulator.of_cart(cart)
-    return emulated_plant(emulator.model_copy(update={"start": start}), control_period, prompt, plant.rehome)
+    settings, asked = plant.over(bridge.port), asking(plant, confirm)
+    return SerialPlant(settings, start, control_period, prompt, bridge, confirm, hardware, asked)
 
 
 def emulated_plant(

@@ -23,7 +23,7 @@ from cartpole_rl.choices import choice
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import ConfigError, LinkError, PlantError
 from cartpole_rl.plants.emulated import BridgeProcess
-from cartpole_rl.plants.serial.plant import SerialPlant, bridged_cart
+from cartpole_rl.plants.serial.plant import SerialPlant, cart_on_port
 from cartpole_rl.plants.serial.preparation import always, nobody
 from cartpole_rl.plants.settings import DriverSettings, TextSettings
 from cartpole_rl.rig.hardware import Hardware, hardware_of
@@ -55,7 +55,7 @@ def board(**options: Any) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
 
 def driven(port: str, period: float = 0.01, hardware: Hardware = RIG, **changed: Any) -> SerialPlant:
     settings = TextSettings(**STEPPER | {"port": port} | changed)
-    return bridged_cart(settings, EmulatorSettings(), period, "hanging", print, always, hardware.model_dump())
+    return cart_on_port(settings, EmulatorSettings(), period, "hanging", print, always, hardware.model_dump())
 
 
 def push(plant: SerialPlant, motor: int) -> TensorDict:
@@ -154,7 +154,7 @@ def test_a_cart_that_is_put_in_place_by_hand_needs_a_person() -> None:
         settings = TextSettings(**STEPPER, port=port)
         with (
             closing(
-                bridged_cart(settings, EmulatorSettings(), 0.01, "hanging", print, nobody, RIG.model_dump())
+                cart_on_port(settings, EmulatorSettings(), 0.01, "hanging", print, nobody, RIG.model_dump())
             ) as plant,
             pytest.raises(
                 PlantError, match=r"plant\.homing=hand: a person has to put the cart in the middle"
