@@ -1,10 +1,10 @@
-"""``python -m cartpole_rl.emulator '{"clock": "real"}'``: start an emulated cart and print its port.
+"""``python -m cartpole_rl.emulator '{"clock": "real"}'``: an emulated cart for the program that starts it.
 
-One JSON line, ``{"port": "/dev/pts/3", "pid": 4711}``, goes to stdout when the port can be opened. Exit
-status: 0 after SIGINT or SIGTERM, 2 for invalid settings, 1 if the cart cannot be emulated on this machine.
+The argument has the settings as JSON. One JSON line, ``{"port": "/dev/pts/3", "pid": 4711}``, goes to stdout
+when the port can be opened. The cart ends with the process that started it. Exit status: 0 after SIGINT or
+SIGTERM, 2 for invalid settings, 1 if the cart cannot be emulated on this machine.
 """
 
-import argparse
 import sys
 
 from pydantic import ValidationError
@@ -15,26 +15,11 @@ from cartpole_rl.errors import CartPoleError, ConfigError
 from cartpole_rl.signals import end_with_parent, starting_process
 
 
-def main(arguments: list[str] | None = None) -> int:
+def main(text: str = "{}") -> int:
     """Run an emulated cart until it is interrupted; return the exit status."""
-    parent = starting_process()
-    parser = argparse.ArgumentParser(
-        prog="python -m cartpole_rl.emulator",
-        description="Emulate a cart on a pseudo-terminal or a TCP port. Prints its port as one JSON line.",
-    )
-    parser.add_argument(
-        "settings",
-        nargs="?",
-        default="{}",
-        help='settings as JSON, such as \'{"clock": "real"}\' (docs/emulator.md)',
-    )
-    parser.add_argument("--exit-with-parent", action="store_true", help="stop when the parent process ends")
-    options = parser.parse_args(arguments)
+    end_with_parent(starting_process())
     try:
-        settings = read_settings(options.settings)
-        if options.exit_with_parent:
-            end_with_parent(parent)
-        run(settings)
+        run(read_settings(text))
     except CartPoleError as error:
         print(error, file=sys.stderr)
         return error.exit_code
@@ -54,4 +39,4 @@ def read_settings(text: str) -> EmulatorSettings:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(*sys.argv[1:2]))

@@ -10,7 +10,6 @@ import tempfile
 from contextlib import suppress
 from queue import Empty, SimpleQueue
 from threading import Thread
-from types import TracebackType
 from typing import Self
 
 from pydantic import BaseModel
@@ -41,12 +40,12 @@ class CartProcess:
 
     what = "the emulated cart"
 
-    def __init__(self, module: str, *arguments: str) -> None:
-        """Start ``python -m module arguments``, and wait for its first line."""
+    def __init__(self, module: str, settings: str) -> None:
+        """Start ``python -m module settings``, and wait for its first line."""
         self._told = False  # somebody knows why it ended
         self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 - open as long as the process
         self._process = subprocess.Popen(
-            [sys.executable, "-m", module, *arguments],
+            [sys.executable, "-m", module, settings],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=self._stderr,
@@ -102,12 +101,7 @@ class CartProcess:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         died = self.died
         self.close()
         if died and error is None:
@@ -144,7 +138,7 @@ class EmulatedCart(CartProcess):
 
     def __init__(self, truth: EmulatorSettings) -> None:
         self.truth = truth
-        super().__init__("cartpole_rl.emulator", truth.model_dump_json(), "--exit-with-parent")
+        super().__init__("cartpole_rl.emulator", truth.model_dump_json())
 
     @property
     def settings(self) -> SerialSettings:

@@ -168,7 +168,7 @@ class TestProcess:
         """Its parent is another process then, from the start."""
         gone = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], stdout=subprocess.PIPE)
         cart = subprocess.run(
-            [sys.executable, "-m", "cartpole_rl.emulator", "--exit-with-parent"],
+            [sys.executable, "-m", "cartpole_rl.emulator"],
             env={**os.environ, PARENT: gone.stdout.decode().strip()},
             timeout=60,
             check=False,

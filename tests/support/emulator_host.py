@@ -87,14 +87,13 @@ class EmulatorHost:
 
 
 @contextlib.contextmanager
-def emulator(*options: str, **settings: object) -> Iterator[EmulatorHost]:
+def emulator(**settings: object) -> Iterator[EmulatorHost]:
     """Run an emulator; terminate it at the end and check that its exit status is 0."""
     command = [
         sys.executable,
         "-m",
         "cartpole_rl.emulator",
         json.dumps({"firmware": UnderTest.kind} | settings),
-        *options,
     ]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
