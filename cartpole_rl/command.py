@@ -66,7 +66,7 @@ def run_command(name: str, verb: "Verb") -> None:
         if "--version" in given:
             print(f"cartpole_rl {__version__}")
             return
-        if wrong := wrong_option(given) or dashed_setting(given):
+        if wrong := wrong_option(given):
             raise ConfigError(wrong)
         provide_config(name, schema)
         with hydra_overrides(name, as_multirun(given)) as (words, as_typed), sweep(name, schema):
@@ -156,24 +156,21 @@ def wrapped(line: str) -> str:
 
 
 def wrong_option(words: Sequence[str]) -> str | None:
-    """Return the message about a misspelt option of Hydra or --cfg without its value; None without one."""
+    """Return the message about the first word with dashes that Hydra does not take; None without one.
+
+    It is a misspelt option, --cfg without its value, or a setting, like `--seed=1` or `--seed 1`.
+    """
     for word, following in pairwise([*words, ""]):
         if word in ("--cfg", "-c") and following not in SHOWN:
             return f"{word}: give {word} job"
-        name = word.removeprefix("--")
-        if name == word or any(option.startswith(name) for option in HYDRA_OPTIONS):
+        dashed = re.fullmatch(r"--?([A-Za-z_.-]+)=.*|--([A-Za-z_.-]+)", word)
+        name = dashed[1] or dashed[2] if dashed else ""
+        if any(option.startswith(name) for option in HYDRA_OPTIONS):
             continue
         near = most_similar(name, WHOLE_OPTIONS)
         if similarity(name, near)[0] >= NEAR_OPTION:
             return f"{word}: did you mean --{near}?"
-    return None
-
-
-def dashed_setting(words: Sequence[str]) -> str | None:
-    """Return the message about the first word like `--seed=1` or `--seed 1`, which Hydra does not take."""
-    for word, following in pairwise([*words, ""]):
-        dashed = re.fullmatch(r"--?([A-Za-z_.]+)=.*", word) or re.fullmatch(r"--([A-Za-z_.]+)", word)
-        if dashed and not any(option.startswith(dashed[1]) for option in HYDRA_OPTIONS):
+        if "-" not in name:  # as --config-dir has
             setting = word.lstrip("-")
             if "=" not in word:
                 setting += "=..." if re.search("=|^--|^$", following) else f"={following}"
