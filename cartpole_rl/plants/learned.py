@@ -145,18 +145,8 @@ class LearnedPlant(SimulatedPlant):
         compiled: bool = False,
         hardware: Hardware | None = None,
     ) -> None:
-        super().__init__(
-            carts,
-            randomizer,
-            start,
-            model.models,
-            model.period,
-            model.substeps,
-            seed,
-            device,
-            compiled,
-            hardware,
-        )
+        physics = model.models, model.period, model.substeps
+        super().__init__(carts, randomizer, start, *physics, seed, device, compiled, hardware)
         # the member that moves each cart, [N]; it changes in place when a row resets
         self.member = torch.zeros(carts, dtype=torch.int64, device=self.device)
         memory = model.residual.memory

@@ -20,7 +20,6 @@ from itertools import pairwise
 from operator import index
 from statistics import mean, median
 from threading import Lock, Thread
-from types import TracebackType
 from typing import Self
 
 from cartpole_rl.emulator.firmware import LARGEST_MOTOR, WATCHDOG_PERIODS, Firmware
@@ -608,12 +607,7 @@ class Bridge:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        why: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: object, why: BaseException | None, traceback: object) -> None:
         """Stop the board, whatever has happened; signals wait until then. Raises LinkError if it cannot."""
         unstopped: Exception | None = None
         for number in (signal.SIGINT, *ending_signals()):

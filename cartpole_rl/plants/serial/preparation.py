@@ -205,8 +205,9 @@ class Preparation:
             pole = 2 * math.pi * state.pole_counts / self._cart.information.pole_counts_per_turn
             off = math.remainder(pole - position.angle, 2 * math.pi)
             window.append((state.time_us, pole))
-            away = abs(state.cart_counts) > farthest
-            if away or abs(off) > position.tolerance or _spread(window) > position.sway:
+            angles = [angle for _, angle in window]
+            away, sway = abs(state.cart_counts) > farthest, max(angles) - min(angles)
+            if away or abs(off) > position.tolerance or sway > position.sway:
                 window.clear()
             elif microseconds_between(window[0][0], state.time_us) >= STILL_SECONDS * 1e6:
                 return
@@ -222,9 +223,3 @@ class Preparation:
                     f"{math.degrees(position.tolerance):.0f} deg of {self.start}; "
                     f"it is {math.degrees(off):+.1f} deg off: {position.remedy}"
                 )
-
-
-def _spread(window: deque[tuple[int, float]]) -> float:
-    """Return the largest minus the smallest angle in rad."""
-    angles = [angle for _, angle in window]
-    return max(angles) - min(angles)

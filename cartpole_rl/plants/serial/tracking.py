@@ -90,10 +90,7 @@ class LinkStatistics:
 
     def clear(self) -> None:
         """Reset all counts."""
-        self.frames_received = self.bad_frames = self.lost_frames = self.late_ticks = 0
-        self.overtaken_frames = self.repeated_frames = 0
-        self.latency.clear()
-        self.loop_times.clear()
+        vars(self).update(vars(LinkStatistics()))
 
 
 class StateTracker:
