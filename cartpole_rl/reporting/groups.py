@@ -153,11 +153,11 @@ def _grey(colours: Mapping[str, str], what: str = "lines") -> str:
 def _drawn(labels: Sequence[str], colours: Mapping[str, str]) -> list[str]:
     """Return the labels whose lines are drawn: those with a colour, and MOST_GREY of the others."""
     grey = [label for label in labels if colours[label] == MUTED]
-    kept = {*_evenly(grey, MOST_GREY)}
+    kept = {*evenly(grey, MOST_GREY)}
     return [label for label in labels if colours[label] != MUTED or label in kept]
 
 
-def _evenly(items: Sequence[Content], most: int) -> list[Content]:
+def evenly(items: Sequence[Content], most: int) -> list[Content]:
     """Return at most `most` items, evenly chosen, the first and the last among them."""
     if len(items) <= most:
         return [*items]
@@ -297,7 +297,7 @@ def _draw_row(axes: Axes, height: float, values: Array, colour: str) -> None:
     if not values.size:
         _row_text(axes, 0.01, height, "no agent", color=MUTED, style="italic")
         return
-    dots = values if values.size <= MOST_DOTS else np.array(_evenly(sorted(values), MOST_DOTS))
+    dots = values if values.size <= MOST_DOTS else np.array(evenly(sorted(values), MOST_DOTS))
     places = height - 0.2 + JITTER * (np.arange(dots.size) % 3 - 1)
     axes.plot(dots, places, "o", color=colour, alpha=0.5, markersize=DOT, markeredgewidth=0)
     found, middle = estimate(values), height + 0.2

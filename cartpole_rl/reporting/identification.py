@@ -28,6 +28,7 @@ from cartpole_rl.physics.friction import viscous_coefficient
 from cartpole_rl.physics.laws import Law
 from cartpole_rl.physics.parameters import CartParameters, cart_column
 from cartpole_rl.reporting import style, texts
+from cartpole_rl.reporting.groups import evenly
 from cartpole_rl.reporting.predictions import draw_angle, draw_position
 from cartpole_rl.reporting.style import document, escaped, table
 from cartpole_rl.reporting.texts import interval_text, number_text
@@ -82,7 +83,9 @@ def identification_figures(
             force_curve(fit.parameters, carts, fit.nominal, models.actuator),
         ),
         "intervals": interval_figure(intervals(fit, carts)),
-        "experiments": experiments_figure(thinned(dict(zip(fitted, found.fitted, strict=True)))),
+        "experiments": experiments_figure(
+            dict(evenly([*zip(fitted, found.fitted, strict=True)], MOST_DRAWN))
+        ),
         "held_out": experiments_figure({HELD_OUT: found.held_out[0]}),
         "unexplained": unexplained_figure(unexplained(found.fitted, fit.parameters["latency"])),
         "spectrum": spectrum_figure(fit.covariance, [unknown.name for unknown in fit.unknowns]),
@@ -241,13 +244,6 @@ def _draw_interval(axes: Axes, height: int, quantity: Quantity) -> None:
     axes.plot(np.clip(away, -FARTHEST, FARTHEST), height, marker, color=PRIOR, markersize=6)
     text = f"{interval_text(value, low, high)} {quantity.unit}   (prior {number_text(prior)})"
     style.beside(axes, height, text, colours.INK)
-
-
-def thinned(replays: Mapping[str, Replayed]) -> dict[str, Replayed]:
-    """Return at most MOST_DRAWN replays, evenly spread over all."""
-    names = list(replays)
-    chosen = np.unique(np.linspace(0, len(names) - 1, min(MOST_DRAWN, len(names))).round().astype(int))
-    return {names[index]: replays[names[index]] for index in chosen}
 
 
 def experiments_figure(replays: Mapping[str, Replayed]) -> Figure:

@@ -12,18 +12,16 @@ from typing import Any, Protocol, get_args
 
 import numpy as np
 
+from cartpole_rl.reporting import texts
 from cartpole_rl.reporting.statistics import Array, Estimate, estimate
 from cartpole_rl.reporting.texts import MOST_DECIMALS, count_text, interval_text, number_text
 from cartpole_rl.tasks.settings import Measure
 
 GOOD = {"score": 2000.0}  # measure: value above which the thesis calls an agent good (section 6)
 MEASURES = {  # key of metrics.json: label
-    "score": "score (6.2)",
+    **texts.SCORES,
     "score_upright": "score (6.1)",
-    "steps": "steps",
-    "upright_fraction": "share of time upright",
     "upright_at_end": "share upright at the end",
-    "time_to_upright_s": "time to upright, s",
     "errors.median": "median relative error of the parameters",
     "network_over_physics.theta_deg": "error of the angle, with / without network",
 }
