@@ -40,7 +40,7 @@ class Terminated(BaseException):
 def exit_with_message(name: str, error: Exception, plants: Collection[str] = ()) -> NoReturn:
     """Print an error and its notes, and exit; `plants` are those that the command takes.
 
-    Raises an OSError that concerns no file: it is a defect of this package.
+    Raises an OSError that concerns no file.
     """
     if isinstance(error, BrokenPipeError):
         exit_if_nobody_reads()
@@ -49,23 +49,30 @@ def exit_with_message(name: str, error: Exception, plants: Collection[str] = ())
         code = error.exit_code
     elif isinstance(error, OF_HYDRA):
         code = ConfigError.exit_code
-    elif isinstance(error, OSError) and not error.filename and error.errno not in UNNAMED:
+    elif is_defect(error):
         raise error
     print_message(name, "; ".join([one_line(error, name, plants), *getattr(error, "__notes__", ())]))
     sys.exit(code)
 
 
+def is_defect(error: Exception) -> bool:
+    """Return True for an error of no expected kind, or an OSError that concerns no file."""
+    if isinstance(error, OSError) and not isinstance(error, OF_HYDRA):
+        return not error.filename and error.errno not in UNNAMED
+    return not isinstance(error, EXPECTED)
+
+
 def one_line(error: Exception, name: str, plants: Collection[str] = ()) -> str:
-    """Return what cartpole-<name> prints of an error; with its class if it is not an expected one."""
+    """Return what cartpole-<name> prints of an error; with its class if it is a defect."""
     if isinstance(error, OF_HYDRA):
         return error_message(error, name, sys.argv[1:], plants)
-    if isinstance(error, OSError):
+    if isinstance(error, OSError) and not is_defect(error):
         remedy = "; make room" if error.errno in FULL else ""
         if remedy and not any(word.startswith("resume=") for word in sys.argv):  # which keeps its folder
             remedy += ", or give hydra.run.dir= a folder on another disk"
         return f"{error.filename or 'a file was not written'}: {error.strerror}{remedy}"
     first = reason_of(error)
-    return first if isinstance(error, EXPECTED) else f"{type(error).__name__}: {first}"
+    return f"{type(error).__name__}: {first}" if is_defect(error) else first
 
 
 def exit_after_signal(name: str, signalled: BaseException) -> NoReturn:

@@ -28,7 +28,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict, read_write
 from cartpole_rl.checking import kinds, validated
 from cartpole_rl.composition import as_mapping, is_completing, task_overrides
 from cartpole_rl.errors import CartPoleError, ConfigError
-from cartpole_rl.exits import EXPECTED, OF_HYDRA, exit_with_message, one_line
+from cartpole_rl.exits import OF_HYDRA, exit_with_message, is_defect, one_line
 from cartpole_rl.files import write_text
 from cartpole_rl.run_folder import ERROR
 from cartpole_rl.settings import Settings
@@ -172,7 +172,7 @@ def run_as_job(name: str, folder: Path, work: Callable[[], float | None]) -> flo
         result = work()
     except Exception as error:
         print_message(name, reason := one_line(error, name))
-        details = "" if isinstance(error, EXPECTED) else traceback.format_exc()
+        details = traceback.format_exc() if is_defect(error) else ""
         write_text(folder / ERROR, f"{reason}\n{details}")
         return None
     (folder / ERROR).unlink(missing_ok=True)

@@ -24,7 +24,8 @@ def main(text: str = "{}") -> int:
         print(error, file=sys.stderr)
         return error.exit_code
     except OSError as error:
-        print(f"journal={error.filename}: {error.strerror}; give the path of a new file", file=sys.stderr)
+        of_file = f"journal={error.filename}: {error.strerror}; give the path of a new file"
+        print(of_file if error.filename else error, file=sys.stderr)
         return 1
     return 0
 

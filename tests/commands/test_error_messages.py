@@ -39,6 +39,8 @@ def test_other_errors_keep_their_first_line() -> None:
     assert one_line(ConfigError(), "train") == "ConfigError"
     assert one_line(ValueError("the first\nthe second"), "train") == "ValueError: the first"
     assert one_line(HydraException("broken\n  in two"), "train") == "broken in two"
+    refused = ConnectionRefusedError(errno.ECONNREFUSED, "refused")  # of no file
+    assert one_line(refused, "train") == f"ConnectionRefusedError: {refused}"
 
 
 def test_a_setting_of_a_group_that_is_not_chosen_names_its_choices() -> None:
