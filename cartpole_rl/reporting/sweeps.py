@@ -436,7 +436,7 @@ def _seeds(seeds: set[int]) -> str:
 def _untraced(sweep: Sweep) -> list[str]:
     """Return a note on agents whose own runs are not there."""
     named = {member.run.agent for member in sweep.members if member.agent is None} - {"", str(BASELINE)}
-    lost = [agent for agent in named if Path(agent).parts[0] != PRETRAINED]
+    lost = [agent for agent in named if Path(agent).parts[:1] != (PRETRAINED,)]
     return (
         [f"The runs of {count_text(len(lost), 'agent')} were not found and are not checked."] if lost else []
     )

@@ -153,6 +153,9 @@ def test_the_agents_of_evaluations_count(study: Path, edit: Edit) -> None:
     shutil.rmtree("agents")
     (lost,), _ = grouped([read_sweep("runs", ["quick/friction/*/*/evaluations/heavy"], MEASURE)])
     assert "The runs of 3 agents were not found and are not checked." in results_of(lost, MEASURE).notes
+    edit(study / "much/10/evaluations/heavy/config.yaml", lambda content: content.update(run="."))
+    (lost,), _ = grouped([read_sweep("runs", ["quick/friction/*/*/evaluations/heavy"], MEASURE)])
+    assert "The runs of 3 agents were not found and are not checked." in results_of(lost, MEASURE).notes
 
 
 def test_versions_and_commands_are_compared_over_both_sets(study: Path, edit: Edit) -> None:
