@@ -23,7 +23,9 @@ ONBOARD = Path("onboard")  # as `policy`: the agent that is evaluated
 Port = Literal["auto", "pty", "tcp"]
 MotorValue = Annotated[float, Field(ge=0, le=LARGEST_MOTOR)]
 Coefficient = Annotated[float, Field(allow_inf_nan=False)]
-# numbers of a file that are added to those of the default cart
+# numbers of a file that the emulated cart has, and that scale those of the default cart or are added to them
+TAKEN = ("backdrivability", "coasting")
+SCALED = ("cart_mass", "cart_viscous", "pole_viscous", "pole_drag")
 ADDED = ("force_asymmetry", "motor_time_constant", "latency_jitter", "track_tilt", "angle_offset")
 
 
@@ -128,15 +130,9 @@ class EmulatorSettings(Settings):
             "track_half_length": default.track_half_length
             + hardware.half_span
             - nominal_hardware().half_span,
-            "cart_mass": times("cart_mass"),
-            "cart_viscous": times("cart_viscous"),
             "cart_coulomb_left": times("cart_coulomb_left", "cart_coulomb"),
             "cart_coulomb_right": times("cart_coulomb_right", "cart_coulomb"),
-            "pole_viscous": times("pole_viscous"),
             "pole_coulomb": times("pole_coulomb", "pole_viscous"),
-            "pole_drag": times("pole_drag"),
-            "backdrivability": numbers["backdrivability"],
-            "coasting": numbers["coasting"],
             "force_curve": (
                 numbers["force_quadratic"],
                 slope * numbers["force_linear"] / of_ip02["force_linear"],
@@ -146,6 +142,8 @@ class EmulatorSettings(Settings):
             "deadband_left": wide("deadband_left"),
             "deadband_right": wide("deadband_right"),
             "latency": max(0.0, plus("latency")),
+            **{name: numbers[name] for name in TAKEN},
+            **{name: times(name) for name in SCALED},
             **{name: plus(name) for name in ADDED},
         }
         changes = {

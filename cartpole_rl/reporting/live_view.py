@@ -75,8 +75,7 @@ def draw(memory: Memory, title: str, colour: bool) -> NoReturn:
     """Draw the newest snapshot again and again."""
     newest, changed, size = 0, time.monotonic(), (0, 0)
     while True:
-        found = read(memory)
-        number, snapshot = found or (0, None)
+        number, snapshot = read(memory) or (0, None)
         if number != newest:
             newest, changed = number, time.monotonic()
         columns, rows = terminal = shutil.get_terminal_size()
