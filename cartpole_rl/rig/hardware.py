@@ -133,7 +133,14 @@ def parameters_of(cart: Mapping[str, float]) -> dict[str, float]:
 def hardware_of(cart: Mapping[str, float]) -> Hardware:
     """Return the hardware in a cart's file, ip02's where it gives none. Raises ConfigError."""
     given = {name: cart[name] for name in HARDWARE if name in cart}
-    return nominal_hardware() if not given else _hardware(tuple(given.items()))
+    hardware = nominal_hardware() if not given else _hardware(tuple(given.items()))
+    end = cart.get("track_half_length", 0.0)
+    if end > hardware.half_span:
+        raise ConfigError(
+            f"cart.track_half_length is {end:g} m, but the stops are {hardware.half_span:g} m from the middle "
+            f"by track_span; give at most {hardware.half_span - hardware.soft_limit:g} m, up to the soft limit"
+        )
+    return hardware
 
 
 @cache

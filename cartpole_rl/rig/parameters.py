@@ -188,10 +188,3 @@ def check_cart(cart: Mapping[str, float]) -> None:
             nearest = most_similar(name, [*PARAMETERS, *HARDWARE])
             raise ConfigError(f"cart.{name}: there is no such setting; did you mean cart.{nearest}?")
         check_value(name, value)
-    numbers = hardware_of(cart)
-    if cart.get("track_half_length", 0.0) > numbers.half_span:
-        most = numbers.half_span - numbers.soft_limit
-        raise ConfigError(
-            f"cart.track_half_length is {cart['track_half_length']:g} m, but half of track_span is "
-            f"{numbers.half_span:g} m; give at most {most:g} m, up to the soft limit, or mend track_span"
-        )

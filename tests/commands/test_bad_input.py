@@ -66,7 +66,7 @@ def test_training(words: str, named: str, remedy: str, tmp_path: Path) -> None:
         ("", "cart_mass is missing; give it, or take what is missing from a choice: defaults: [ip02]"),
         ("mas: 1\n", "mas: there is no such setting; did you mean cart_mass?"),
         ("defaults: [ip02]\nmas: 1\n", "mas: there is no such setting; did you mean cart_mass?"),
-        ("defaults: [ip02]\ncart_mass: -1\n", "cart_mass is -1; it must be above 0"),
+        ("defaults: [ip02]\ncart_mass: -1\n", "cart_mass is -1; it must be above 0 and at most 100"),
         (
             "defaults: [ip2]\n",
             "defaults: there is no choice ip2; did you mean ip02? "
@@ -287,7 +287,7 @@ def test_in_a_multirun_the_other_jobs_run(tmp_path: Path) -> None:
     assert not (finished[0].parent / "error.txt").exists()
     assert done.err.splitlines()[-2:] == [
         f"cartpole-train: 1 of 2 jobs failed in {finished[0].parents[1].relative_to(tmp_path)}:",
-        "cartpole-train: 0_cart.cart_mass--1: cart_mass is -1; it must be above 0",
+        "cartpole-train: 0_cart.cart_mass--1: cart_mass is -1; it must be above 0 and at most 100",
     ]
 
 

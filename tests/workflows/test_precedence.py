@@ -13,9 +13,10 @@ import yaml
 from cartpole_rl.checking import validated
 from cartpole_rl.choices import choice, default_choices, group_choices
 from cartpole_rl.composition import compose
+from cartpole_rl.errors import ConfigError
 from cartpole_rl.rig.hardware import parameters_of
-from cartpole_rl.workflows.build import replaced_settings
-from cartpole_rl.workflows.checks import note_other_numbers
+from cartpole_rl.workflows.build import own_training, replaced_settings
+from cartpole_rl.workflows.checks import check_training, note_other_numbers
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig, load_settings
 
 IP02 = choice("cart/ip02")
@@ -211,3 +212,28 @@ def test_numbers_that_are_not_nominal_are_printed(capsys: pytest.CaptureFixture[
         note_other_numbers("train", config.nominal_cart, (config.pole.choices or {}).values())
         head = "cartpole-train: note: no cart in conf/ has these numbers: "
         assert capsys.readouterr().err == (f"{head}{line}\n" if line else "")
+
+
+@pytest.mark.parametrize("task", [{}, {"task": "swingup"}])
+def test_an_evaluation_with_a_cart_ends_at_its_track(task: dict[str, str]) -> None:
+    """Also the baseline's, whose settings are those of a training of ip02."""
+    config = load_settings(EvaluateConfig, {"run": "lqr", "cart": "sensorsini", "pole": "sensorsini", **task})
+    training = own_training(config, ("cart",), {})
+    assert replaced_settings(training, config).task.x_max == choice("cart/sensorsini")["track_half_length"]
+
+
+@pytest.mark.parametrize(
+    ("cart", "message"),
+    [
+        (
+            {"track_span": 0.5},
+            r"track_half_length is 0\.38 m, but the stops are 0\.25 m .* 0\.223 m",
+        ),
+        ({"cart_mass": 350}, "cart_mass is 350; it must be above 0 and at most 100"),
+    ],
+)
+def test_a_cart_in_other_units_is_refused(cart: dict[str, float], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        check_training(
+            load_settings(TrainConfig, {f"cart.{name}": each for name, each in cart.items()}), Path(), []
+        )

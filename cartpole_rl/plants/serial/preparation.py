@@ -211,15 +211,13 @@ class Preparation:
                 window.clear()
             elif microseconds_between(window[0][0], state.time_us) >= STILL_SECONDS * 1e6:
                 return
-            if now() > deadline and away:
+            if now() > deadline:
                 millimetres = 1e3 * hardware.encoders.metres * state.cart_counts
                 raise PlantError(
                     f"the cart is {millimetres:+.0f} mm from the middle of its track: bring it back by hand, "
                     "and hold only the pole"
-                )
-            if now() > deadline:
-                raise PlantError(
-                    f"waited {timeout:g} s for the pole to be still within "
+                    if away
+                    else f"waited {timeout:g} s for the pole to be still within "
                     f"{math.degrees(position.tolerance):.0f} deg of {self.start}; "
                     f"it is {math.degrees(off):+.1f} deg off: {position.remedy}"
                 )
