@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cartpole_rl.errors import RecordingError
-from cartpole_rl.identification.fit import correlation
 from cartpole_rl.identification.prediction import REPORTED, Replayed, away_from_upright, replay
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.sensors import Motion, question_sensors, samples_of
@@ -117,11 +116,21 @@ def check_period(episode: Episode, period: float) -> None:
 def check_directions(episodes: Sequence[Episode], period: float) -> None:
     """Raise RecordingError if the angle is half a turn off, or the sign of a column is wrong."""
     samples = samples_of(motions(episodes), period)
-    if samples is not None and samples.falls_upwards:
+    if samples is None:
+        return
+    if samples.falls_upwards:
         raise RecordingError(
             "the pole falls upwards in the recordings: the angle is half a turn off; 0 is upright"
         )
-    _check_signs(episodes, period)
+    if samples.response < -SIGNIFICANT:
+        raise RecordingError(
+            "positive motor values push the cart towards smaller counts: swap the motor's wires, or the "
+            "cart encoder's channels"
+        )
+    if samples.lag < -SIGNIFICANT:
+        raise RecordingError(
+            "the pole runs ahead of its cart instead of staying behind: swap the pole encoder's channels"
+        )
 
 
 def check_same_encoders(recordings: Mapping[str, Episode], hardware: Hardware) -> None:
@@ -280,37 +289,3 @@ def stays_up(episode: Episode, period: float) -> bool:
         and balanced.min() < balanced.mean() - FLICKER
         and balanced.max() > balanced.mean() + FLICKER
     )
-
-
-def _check_signs(episodes: Sequence[Episode], period: float) -> None:
-    """Refuse signs by which the motor pushes the cart backwards, or a hanging pole leads its cart."""
-    pushes, responses, jerks, lags = [], [], [], []
-    for episode in episodes:
-        if episode.steps < 10:
-            continue
-        x_ddot, theta_ddot = (np.diff(values[::3], n=2) for values in (episode.x, episode.theta))
-        motor = np.convolve(episode.motor, np.ones(3) / 3, "valid")[::3]
-        rows = min(len(x_ddot), len(motor) - 1)
-        pushes.append(motor[1 : rows + 1] if len(motor) > rows else motor[:rows])
-        responses.append(x_ddot[:rows])
-        angle = wrap(episode.theta[::3][1:-1] - np.pi)
-        hanging = np.abs(angle[:rows]) < 0.8
-        free = theta_ddot[:rows] + (3 * period) ** 2 * 40 * np.sin(angle[:rows])  # without gravity
-        jerks.append(x_ddot[:rows][hanging])
-        lags.append(free[hanging])
-    if _correlation(pushes, responses) < -SIGNIFICANT:
-        raise RecordingError(
-            "positive motor values push the cart towards smaller counts: swap the motor's wires, or the "
-            "cart encoder's channels"
-        )
-    if _correlation(jerks, lags) < -SIGNIFICANT:
-        raise RecordingError(
-            "the pole runs ahead of its cart instead of staying behind: swap the pole encoder's channels"
-        )
-
-
-def _correlation(first: Sequence[Array], second: Sequence[Array]) -> float:
-    if not first:
-        return 0.0
-    a, b = np.concatenate(first), np.concatenate(second)
-    return correlation(a, b) if len(a) > 10 else 0.0

@@ -80,12 +80,6 @@ class Log(NamedTuple):
     report: Report
 
 
-def read_log(path: Path, layout: Layout, encoders: Encoders) -> Log:
-    """Return the episodes in a log, in counts of `encoders`; see `read_rows` and `cut_log`."""
-    rows = read_rows(path, layout)
-    return cut_log(rows, layout, encoders, layout.period or rows.period)
-
-
 def read_rows(path: Path, layout: Layout) -> Rows:
     """Return the rows of a log: text, or arrays by name in a .npz, .mat or .parquet file.
 

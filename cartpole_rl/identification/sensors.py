@@ -29,12 +29,13 @@ Array = NDArray[np.float64]
 
 WINDOW = 0.144  # s through which a cubic is laid: 9 rows at 20 ms
 LEAST_ROWS = 7
-LEAST_SAMPLES = 200  # of motion, for an estimate
+LEAST_SAMPLES, LEAST_OF_A_SIGN = 200, 50  # of motion, for an estimate and for a sign
 SAMPLES = 20  # of the bootstrap
 PIECE = 100  # rows of a recording that are drawn together
 SWINGING = 1.0  # rad of the pole that tell its scale
 NUMEROV = np.array((1, 10, 1)) / 12  # the mean of an acceleration over which a second difference extends
 EARLIEST, LATEST = 2, 4  # periods before and after its row in which a motor value may come into force
+AT_ONCE = (-1.0, -0.5, 0.0, 0.5, 1.0)  # periods, delays at which a motor value shows its sign
 LONGEST_DELAY = 0.06  # s; with a short period, more than LATEST
 FINEST = 1e-3  # s between two delays that are tried, or a quarter of a period
 SPEED = 0.05  # m/s from which friction opposes the motion of the cart
@@ -71,8 +72,8 @@ class Sensors(NamedTuple):
     position_scale: Estimate | None  # true over recorded position
     delay: Estimate | None  # s from a row's state until its motor value moves the cart
     falls_upwards: bool  # gravity pulls the pole towards the recorded upright: the angle is half a turn off
-    push: float  # correlation of motor values and the cart's acceleration: negative means a wrong sign
-    lag: float  # of the cart's acceleration and the pole's: negative means a wrong sign
+    push: float  # `Samples.response`: negative means a wrong sign
+    lag: float  # `Samples.lag`, with the angle from upright: negative means a wrong sign
 
 
 class Samples:
@@ -138,6 +139,31 @@ class Samples:
         terms = gravity, -self._x_ddot * np.cos(theta), -scale * friction
         return np.stack([self.mean(each) for each in terms], 1)
 
+    @property
+    def other_terms(self) -> Array:
+        """The terms [K, 4] of the cart's acceleration beside the motor's: friction, the track, the pole."""
+        return np.stack((self.x_dot, np.tanh(self.x_dot / SPEED), self.x, self.lean_ddot), 1)
+
+    @property
+    def response(self) -> float:
+        """How much a motor value accelerates its cart at once, apart from all else: 1 always, -1 never.
+
+        Only short delays count. The speed is among all else, so an older value is left with the other sign.
+        """
+        if len(self.piece) < LEAST_OF_A_SIGN:
+            return 0.0
+        others, given = self.other_terms, (self.x_ddot, *map(self.push, AT_ONCE))
+        free, *pushes = (_regression(others, each, None)[1] for each in given)
+        return max((correlation(push, free) for push in pushes), key=abs)
+
+    @property
+    def lag(self) -> float:
+        """How much a cart that accelerates leaves its pole behind: 1 always, -1 never."""
+        if len(self.piece) < LEAST_OF_A_SIGN:
+            return 0.0
+        terms = self.pole_terms()
+        return correlation(terms[:, 1], _regression(terms[:, ::2], self.theta_ddot, None)[1])
+
     def push(self, periods: float) -> Array:
         """Return the mean motor value [K], in force `periods` after its state."""
         return self.mean(np.concatenate([delayed(motion.motor, periods) for motion in self._motions]))
@@ -153,8 +179,6 @@ def question_sensors(
     samples = samples_of(motions, period)
     if samples is None:
         return Sensors(None, None, None, None, False, 0.0, 0.0)
-    delays = np.arange(-EARLIEST, max(LATEST, LONGEST_DELAY / period) + 0.01, max(0.25, FINEST / period))
-    pushes = [samples.push(each) for each in delays]
     dice = np.random.default_rng(0)
     upwards = samples.falls_upwards
     scale = zero = position = delay = None
@@ -163,11 +187,10 @@ def question_sensors(
         known = (each.high - each.low < widest for each, widest in zip(found, WIDEST, strict=True))
         scale, zero, position = (each if sure else None for each, sure in zip(found, known, strict=True))
         zero = None if upwards else zero
-    if samples.moves and pushes[0].std() > 0:
-        delay = delay_estimate(samples, pushes, period * delays, dice, on_step)
-    correlations = [correlation(push, samples.x_ddot) for push in pushes]
-    lag = -_lag(samples) if upwards else _lag(samples)
-    return Sensors(scale, zero, position, delay, upwards, max(correlations, key=abs), lag)
+    if samples.moves and samples.push(0).std() > 0:
+        delay = delay_estimate(samples, period, dice, on_step)
+    lag = -samples.lag if upwards else samples.lag
+    return Sensors(scale, zero, position, delay, upwards, samples.response, lag)
 
 
 def samples_of(motions: Sequence[Motion], period: float) -> Samples | None:
@@ -226,23 +249,19 @@ def angle_estimates(
 
 
 def delay_estimate(
-    samples: Samples,
-    pushes: Sequence[Array],
-    delays: Array,
-    dice: np.random.Generator,
-    on_step: Callable[[], object],
+    samples: Samples, period: float, dice: np.random.Generator, on_step: Callable[[], object]
 ) -> Estimate | None:
     """Return the time from a state to the effect of its motor value on the cart, s; None beyond `delays`.
 
     By equation (3.5), the centre of mass of cart and pole accelerates under motor and friction alone.
     """
-    direction = np.tanh(samples.x_dot / SPEED)
+    delays = np.arange(-EARLIEST, max(LATEST, LONGEST_DELAY / period) + 0.01, max(0.25, FINEST / period))
+    pushes, others = [samples.push(each) for each in delays], samples.other_terms
+    delays = period * delays
 
     def best(weights: Array | None) -> float:
         on_step()
-        terms = (
-            np.stack((push, samples.x_dot, direction, samples.x, samples.lean_ddot), 1) for push in pushes
-        )
+        terms = (np.column_stack((push, others)) for push in pushes)
         sizes = [np.mean(_regression(each, samples.x_ddot, weights)[1] ** 2) for each in terms]
         return _lowest(delays, np.array(sizes))
 
@@ -277,13 +296,3 @@ def _lowest(places: Array, sizes: Array) -> float:
     bend = before - 2 * now + after
     shift = 0.5 * (before - after) / bend if bend > 0 else 0.0
     return float(places[index] + shift * (places[1] - places[0]))
-
-
-def _lag(samples: Samples) -> float:
-    """Return how much a cart that accelerates leaves its pole behind: 1 always, -1 never."""
-    terms = samples.pole_terms()
-    if len(terms) < LEAST_SAMPLES:
-        return 0.0
-    others = terms[:, ::2]
-    free = samples.theta_ddot - others @ np.linalg.lstsq(others, samples.theta_ddot, rcond=None)[0]
-    return correlation(terms[:, 1], free)

@@ -4,6 +4,7 @@ import importlib
 import re
 import textwrap
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +18,15 @@ from cartpole_rl.choices import choice, conf_folder
 from cartpole_rl.composition import compose
 from cartpole_rl.errors import ConfigError, RecordingError
 from cartpole_rl.evaluation.recordings import read_recording, write_recording
-from cartpole_rl.identification.checks import check_recordings
+from cartpole_rl.identification.checks import check_directions, check_recordings
 from cartpole_rl.identification.experiments import recording
-from cartpole_rl.identification.logs import read_log
+from cartpole_rl.identification.logs import Log, cut_log, read_rows
 from cartpole_rl.identification.sensors import Motion, question_sensors
 from cartpole_rl.identification.settings import ImportConfig, Layout
 from cartpole_rl.identification.windows import cut_windows
-from cartpole_rl.rig.hardware import nominal_encoders
+from cartpole_rl.rig.hardware import Encoders, nominal_encoders
 from cartpole_rl.run_folder import experiments
+from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.import_logs import import_logs
 
 PERIOD, STEPS, LENGTH = 0.02, 1500, 0.3  # s; length of the equivalent simple pendulum, m
@@ -36,6 +38,7 @@ LAYOUT: dict[str, Any] = {
 }
 Columns = dict[str, np.ndarray]
 ENCODERS = nominal_encoders()
+GAINS = np.array((820.0, 1218.0, 460.0, 213.0))  # of x, theta and their rates: poles at -2, -2.5, -5, -6
 
 
 @pytest.fixture(scope="module")
@@ -48,15 +51,24 @@ def swings() -> Columns:
     return driven_pole(100)
 
 
-def driven_pole(most: int, late: int = 10) -> Columns:
-    """A swinging pole on a driven cart, by equation (3.6), in steps of 1 ms; the motor is `late` ms late."""
+def driven_pole(most: int, late: int = 10, balanced: bool = False) -> Columns:
+    """A swinging pole on a driven cart, by equation (3.6), in steps of 1 ms; the motor is `late` ms late.
+
+    With `balanced` the motor keeps the pole upright.
+    """
     dice, fine = np.random.default_rng(3), 20
     motor = np.repeat(dice.integers(-most, most + 1, STEPS // 6), 6).astype(float)
     step = PERIOD / fine
     x, x_dot, theta, theta_dot, rows = 0.0, 0.0, np.pi, 0.5, []
+    if balanced:
+        theta, theta_dot, before = 0.0, 0.1, np.zeros(2)
     for index in range(STEPS * fine):
         if index % fine == 0:
             rows.append((x, theta))
+            if balanced:
+                seen = np.rint((x / ENCODERS.metres, theta / ENCODERS.radians)) * ENCODERS.resolution
+                speeds, before = (seen - before) / PERIOD, seen
+                motor[index // fine] = round(GAINS @ (*seen, *speeds))
         push = motor[max(0, index - late) // fine]
         x_ddot = 0.03 * push - 8 * x_dot - 20 * x
         theta_ddot = (9.81 * np.sin(theta) - x_ddot * np.cos(theta)) / LENGTH - 0.1 * theta_dot
@@ -88,6 +100,11 @@ def layout(**changes: Any) -> Layout:
         for name, change in changes.items()
     }
     return validated(Layout, {**LAYOUT, **values})
+
+
+def read_log(path: Path, layout: Layout, encoders: Encoders) -> Log:
+    rows = read_rows(path, layout)
+    return cut_log(rows, layout, encoders, layout.period or rows.period)
 
 
 def imported(source: Path) -> ImportConfig:
@@ -443,14 +460,27 @@ def test_the_intervals_of_a_swinging_pole_hold_the_truth(swings: Columns) -> Non
         assert estimate.high - estimate.low < 5 * margin
 
 
+def recorded(motion: Columns) -> Episode:
+    counts = np.rint(np.stack((motion["x"] / ENCODERS.metres, motion["a"] / ENCODERS.radians), 1))
+    motor = motion["u"][:-1].astype(np.int64)
+    return recording(counts, np.full(STEPS - 1, PERIOD), motor, "time", ENCODERS)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [("u", "push the cart towards smaller counts"), ("a", "the pole runs ahead"), ("", "")],
+)
+def test_the_signs_of_a_pole_that_is_only_balanced_are_known(wrong: str, message: str) -> None:
+    """The motor follows the pole there, so that its values and the cart's acceleration hardly correlate."""
+    columns = driven_pole(0, balanced=True)
+    assert np.ptp(columns["a"]) < 0.1
+    part = recorded({name: -values if name == wrong else values for name, values in columns.items()})
+    with pytest.raises(RecordingError, match=message) if wrong else nullcontext():
+        check_directions([part], PERIOD)
+
+
 def test_a_pole_that_falls_upwards_is_refused(motion: Columns) -> None:
-    part = recording(
-        np.rint(np.stack((motion["x"] / ENCODERS.metres, (motion["a"] - np.pi) / ENCODERS.radians), 1)),
-        np.full(STEPS - 1, PERIOD),
-        motion["u"][:-1].astype(np.int64),
-        "time",
-        ENCODERS,
-    )
+    part = recorded({**motion, "a": motion["a"] - np.pi})
     with pytest.raises(RecordingError, match="the pole falls upwards in the recordings"):
         check_recordings({"a": part}, {"b": part}, PERIOD)
 
