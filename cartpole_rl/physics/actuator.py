@@ -65,10 +65,12 @@ def step_forces(
     targets = mean_commands(held, latency, period, substeps)
     if LAG not in law.reads:
         return targets, targets[-1]
+    mean, end = lag_shares(cart.motor_time_constant, period / substeps)
     means = []
     for target in targets:
-        mean, force = lagged_force(force, target, cart.motor_time_constant, period / substeps)
-        means.append(mean)
+        gap = force - target
+        means.append(target + gap * mean)
+        force = target + gap * end
     return means, force
 
 
@@ -92,17 +94,8 @@ def mean_commands(
     return means
 
 
-def lagged_force(
-    force: "Tensor", target: "Tensor", time_constant: "Tensor", step: float
-) -> "tuple[Tensor, Tensor]":
-    """Return (mean force over the step, force at its end), N, [N] each: the exact first-order lag."""
-    mean, end = lag_shares(time_constant, step)
-    gap = force - target
-    return target + gap * mean, target + gap * end
-
-
 def lag_shares(time_constant: "Tensor", step: float) -> "tuple[Tensor, Tensor]":
-    """Return the shares of a force's gap to its target that are left: mean over a step, and at its end."""
+    """Return the shares of its gap to the target that a lagged force keeps: mean over a step, at its end."""
     ratio = time_constant.clamp(min=SHORTEST_TIME_CONSTANT) / step
     decay = (-1 / ratio).exp()
     return ratio * (1 - decay), decay

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from cartpole_rl.physics.actuator import ACTUATORS, force_curve, lagged_force, mean_commands, newtons
+from cartpole_rl.physics.actuator import ACTUATORS, force_curve, lag_shares, mean_commands, newtons
 from cartpole_rl.physics.dynamics import Drive, State, advance, mechanism, run_period
 from cartpole_rl.physics.laws import Law
 from cartpole_rl.physics.models import Models
@@ -61,18 +61,17 @@ def test_newtons_ignore_the_parameters_of_the_cart(make_cart: MakeCart) -> None:
 class TestLag:
     @pytest.mark.parametrize("time_constant", [0.001, 0.01, 0.1])
     def test_is_the_analytic_solution(self, time_constant: float) -> None:
-        force, target, step = 1.0, 4.0, 0.02
-        mean, end = lagged_force(at(force), at(target), at(time_constant), step)
-        assert end.item() == pytest.approx(target + (force - target) * math.exp(-step / time_constant))
+        step = 0.02
+        mean, end = lag_shares(at(time_constant), step)
+        assert end.item() == pytest.approx(math.exp(-step / time_constant))
         time = (torch.arange(200_000, dtype=torch.float64) + 0.5) * step / 200_000
-        average = (target + (force - target) * torch.exp(-time / time_constant)).mean().item()
-        assert mean.item() == pytest.approx(average, rel=1e-8)
+        assert mean.item() == pytest.approx(torch.exp(-time / time_constant).mean().item(), rel=1e-6)
 
     @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
     def test_none_without_a_time_constant(self, dtype: torch.dtype) -> None:
-        mean, end = lagged_force(*(at(value).to(dtype) for value in (0.0, 4.0, 0.0)), 0.01)
-        assert mean.item() == pytest.approx(4.0, rel=1e-9)
-        assert end.item() == 4.0
+        mean, end = lag_shares(at(0.0).to(dtype), 0.01)
+        assert mean.item() == pytest.approx(0.0, abs=1e-9)
+        assert end.item() == 0.0
 
 
 def shares(latency: float, commands: int, period: float, substeps: int) -> Tensor:
