@@ -68,12 +68,7 @@ class LearningSettings(Settings):
     checkpoint_interval: Count  # evaluations from one resumable checkpoint to the next
 
     @model_validator(mode="after")
-    def _long_enough(self) -> "LearningSettings":
-        if self.transitions < self.carts * self.chunk * self.evaluations:
-            raise ValueError(
-                f"transitions={self.transitions} is too few; give at least "
-                f"{self.carts * self.chunk * self.evaluations}, or fewer evaluations"
-            )
+    def _returns_have_a_length(self) -> "LearningSettings":
         if self.n_step is None and self.return_time is None:
             raise ValueError("give return_time (s), or n_step (control periods)")
         if self.n_step is not None and self.chunk < self.n_step:
@@ -141,12 +136,8 @@ class DistillationSettings(Settings):
 
 def host_and_port(text: str) -> str:
     """Return `text` if it is host:port. Raises ValueError."""
-    host, _, port = text.rpartition(":")
-    if (
-        not re.fullmatch(r"[^/\s:]+", host)
-        or not re.fullmatch("[0-9]{1,5}", port)
-        or not 0 < int(port) < 65536
-    ):
+    found = re.fullmatch(r"[^/\s:]+:([0-9]{1,5})", text)
+    if not found or not 0 < int(found[1]) < 65536:
         raise ValueError("give host:port, with a port from 1 to 65535")
     return text
 

@@ -40,7 +40,7 @@ WRONG_TRAINING = [
         "give at least 24576, or a shorter warm-up",
     ),
     ("learning.return_time=1", "learning.return_time=1 s is 50 control periods", "give at most 0.4"),
-    ("learning.transitions=100", "learning: transitions=100 is too few", "or fewer evaluations"),
+    ("learning.transitions=100", "learning.transitions=100 is too few", "or fewer evaluations"),
     ("agent.target_period=10", "agent", "either target_tau or target_period"),
     ("actions.motors=[100,100]", "actions", "two or more different values"),
     ("plant=emulated", "plant=emulated: ", "use cartpole-evaluate for plant=emulated"),

@@ -30,7 +30,7 @@ def test_a_sweep_needs_no_dash_m_and_takes_values_of_the_command_line(tmp_path: 
         ("-m seed=0,x", "seed=x: give an integer"),
         ("-m seeed=0,1", "seeed: there is no such setting; did you mean seed?"),
         ("sweep=seeds agent.gamma=1.5", "agent.gamma=1.5: give less than 1"),
-        ("-m learning.transitions=1000000,100", "learning: transitions=100 is too few"),
+        ("-m learning.transitions=1000000,100", "learning.transitions=100 is too few"),
         ("-m resume=a,b", "resume= continues one run; call cartpole-train once for each, without -m"),
     ],
 )

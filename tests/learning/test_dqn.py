@@ -462,7 +462,7 @@ def test_evaluations_are_evenly_spaced_up_to_the_end(count: int, end: int) -> No
     assert 1 <= min(gaps) <= max(gaps) <= min(gaps) + 1
 
 
-WRONG = {"transitions": 100, "n_step": 5, "carts": 0, "epsilon": (1.5, 0.1), "evaluations": 17, "speed": 1}
+WRONG = {"n_step": 5, "carts": 0, "epsilon": (1.5, 0.1), "speed": 1}
 
 
 @pytest.mark.parametrize("name", WRONG)
