@@ -68,6 +68,11 @@ class Fit:
         table = parameters_at(self.point[:, None], self.unknowns, self.nominal)[:, 0]
         return dict(zip(CartParameters.names(), table.tolist(), strict=True))
 
+    @property
+    def by_name(self) -> dict[str, float]:
+        """The numbers of `point` by the names of the unknowns."""
+        return dict(zip((each.name for each in self.unknowns), self.point.tolist(), strict=True))
+
     @solvable()
     def draw(self, count: int, random: np.random.Generator, widen: float = 1.0) -> Array:
         """Return carts [P, count] drawn from the posterior, correlations included. Raises RecordingError."""
@@ -139,28 +144,18 @@ def fit_cart(
     scale = torch.maximum(rough, finest_scale(windows.resolution))
     problem = Matching(simulate, positions, scale, guess, (low, high), on_step)
     if near is None:
-        screened = [problem.minimize(start, guess, SCREENING) for start in starting_points(unknowns)]
+        starts = [start for start in STARTS if start.keys() <= {each.name for each in unknowns}]
+        screened = [problem.minimize(point_of(unknowns, start), guess, SCREENING) for start in starts]
         best = min(screened, key=lambda each: each.cost)
     else:
-        best = Match(starting_point(unknowns, near), guess, math.inf)
+        best = Match(point_of(unknowns, near.by_name), guess, math.inf)
     best = problem.minimize(best.point, best.motion, iterations)
     return described(problem, best, windows, unknowns, nominal)
 
 
-def starting_points(unknowns: Sequence[Unknown]) -> list[Tensor]:
-    """Return those of STARTS, [U] each, whose names are all among the unknowns."""
-    names = [unknown.name for unknown in unknowns]
-    return [
-        torch.tensor([start.get(name, 0.0) for name in names], dtype=torch.float64)
-        for start in STARTS
-        if start.keys() <= {*names}
-    ]
-
-
-def starting_point(unknowns: Sequence[Unknown], near: Fit) -> Tensor:
-    """Return the point of another fit, [U]; an unknown that it lacks is 0."""
-    theirs = dict(zip((each.name for each in near.unknowns), near.point.tolist(), strict=True))
-    return torch.tensor([theirs.get(each.name, 0.0) for each in unknowns], dtype=torch.float64)
+def point_of(unknowns: Sequence[Unknown], values: Mapping[str, float]) -> Tensor:
+    """Return the point [U] with these `values`; an unknown that has none is 0."""
+    return torch.tensor([values.get(each.name, 0.0) for each in unknowns], dtype=torch.float64)
 
 
 def described(

@@ -219,15 +219,13 @@ def widened(fit: Fit, best: Candidate, candidates: Sequence[Candidate]) -> Fit:
     No friction model is exact: one that predicts nearly as well is nearly as probable. `fit` has the friction
     model of `best`.
     """
-    names = [unknown.name for unknown in fit.unknowns]
     covariance, total = np.zeros_like(fit.covariance), 1.0
     for other in candidates:
         if other is best:
             continue
         weight = (best.error.size / other.error.size) ** FALLOFF
-        theirs = dict(zip((each.name for each in other.fit.unknowns), other.fit.point, strict=True))
-        own = dict(zip(names, best.fit.point, strict=True))
-        away = np.array([theirs.get(name, own[name]) - own[name] for name in names])
+        theirs, own = other.fit.by_name, best.fit.by_name
+        away = np.array([theirs.get(name, own[name]) - own[name] for name in own])
         covariance += weight * np.outer(away, away)
         total += weight
     return replace(fit, covariance=within_prior(fit.covariance + covariance / total))
