@@ -82,11 +82,7 @@ class HardwareTransform(Transform):
         self.guard = guard
         self.register_buffer("_by_action", torch.tensor([0, *motors], dtype=torch.int64))  # from NO_ACTION on
         self.first_perception = partial(
-            perceive_first,
-            settings=observation,
-            guard=guard,
-            encoders=encoders,
-            speed_periods=speed_periods,
+            perceive_first, settings=observation, guard=guard, encoders=encoders, speed_periods=speed_periods
         )
         self.perception: Perception = partial(
             perceive, settings=observation, task=task, rewards=reward, guard=guard, encoders=encoders

@@ -140,11 +140,7 @@ def buffer_state(buffer: TensorDictReplayBuffer) -> dict[str, Any]:
         transitions = dict(buffer.storage.get(rows).flatten_keys(".").items())
     sampler = buffer.sampler.state_dict()
     trees = {name: torch.as_tensor(sampler[name][torch.arange(filled)]) for name in TREES if name in sampler}
-    return {
-        "transitions": transitions,
-        "writer": buffer.writer.state_dict(),
-        "sampler": {**sampler, **trees},
-    }
+    return {"transitions": transitions, "writer": buffer.writer.state_dict(), "sampler": {**sampler, **trees}}
 
 
 def restore_buffer(buffer: TensorDictReplayBuffer, snapshot: Mapping[str, Any]) -> None:

@@ -71,14 +71,7 @@ SIMILAR_MASS = 0.2  # share by which an emulated pole may differ from the stated
 MINARI_FILE = "main_data.hdf5"
 TAKEN_BY_REPEAT = ("run", "repeat.run", "repeat.episode", "label", "view")
 # by a fine-tuning: where its learner is, how its cart is reached
-TAKEN_BY_RESUME = (
-    "resume",
-    "learner",
-    "view",
-    "plant.port",
-    "plant.clear_faults",
-    "plant.home_timeout",
-)
+TAKEN_BY_RESUME = ("resume", "learner", "view", "plant.port", "plant.clear_faults", "plant.home_timeout")
 
 
 def check_training(config: TrainConfig, folder: Path, words: Sequence[str]) -> None:

@@ -21,6 +21,7 @@ from cartpole_rl.identification.checks import motions
 from cartpole_rl.identification.logs import (
     FASTEST,
     STALE,
+    TURN,
     Log,
     NotALogError,
     Report,
@@ -48,7 +49,6 @@ LATE = 0.05  # s, or two periods: a cart that takes longer is unusual
 RESAMPLED = 5e-4  # s between rows from which a log may be so fast
 LEAPS = 0.02  # share of rows
 SATURATED = 0.5  # share of rows
-TURN = 2 * np.pi
 
 
 def import_logs(config: ImportConfig, folder: Path) -> Sensors | None:
@@ -233,7 +233,7 @@ def _scale_doubts(sensors: Sensors, layout: Layout) -> Iterator[str]:
     scale, zero, position = sensors.angle_scale, sensors.angle_zero, sensors.position_scale
     if scale is not None and not scale.holds(1, ANGLE_SCALE):
         unit = layout.angle.unit
-        turn = {"rad": TURN, "deg": 360.0, "turn": 1.0}[unit] if isinstance(unit, str) else unit
+        turn = TURN[unit] if isinstance(unit, str) else unit
         factor = _or_unit(scale.value)
         yield (
             f"the angle's scale is refuted by its motion: it turns {factor} as far as recorded; a turn has "
@@ -254,13 +254,8 @@ def _scale_doubts(sensors: Sensors, layout: Layout) -> Iterator[str]:
 
 def _or_unit(factor: float) -> str:
     """Return a factor in words, with the unit that it suggests."""
-    for value, unit in (
-        (TURN / 360, "degrees"),
-        (360 / TURN, "radians"),
-        (1e-3, "mm"),
-        (1e-2, "cm"),
-        (1e3, "m"),
-    ):
+    units = {np.pi / 180: "degrees", 180 / np.pi: "radians", 1e-3: "mm", 1e-2: "cm", 1e3: "m"}
+    for value, unit in units.items():
         if abs(factor / value - 1) < 0.1:
             return f"{factor:.3g} times (the column may be in {unit})"
     return f"{factor:.3f} times"

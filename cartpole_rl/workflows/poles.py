@@ -58,9 +58,7 @@ def pole_text(poles: PoleSettings) -> str:
 
 def lengths(poles: PoleSettings) -> str:
     """Return the lengths in m for a message."""
-    if poles.choices is None:
-        return poles.name
-    return " or ".join(f"{pole.length:.2f} m" for pole in poles.choices.values())
+    return " or ".join(f"{pole.length:.2f} m" for pole in (poles.choices or {}).values()) or poles.name
 
 
 def emulated_words(known: Sequence[PoleSettings]) -> str:
