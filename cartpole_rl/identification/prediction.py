@@ -111,8 +111,7 @@ class Replayed(NamedTuple):
 def replay(recordings: Mapping[str, Episode], dynamics: Dynamics, restart: float) -> list[Replayed]:
     """Return each recording beside the cart of `dynamics`, which is put back onto it every `restart` s.
 
-    All run at once. Raises RecordingError, with the name of the file, for one that is too short or has
-    another control period than `dynamics`.
+    All run at once. Raises RecordingError, with the name of the file, for one that is too short.
     """
     cut, lead = [], lead_periods(LEAD, dynamics.period)
     for file, episode in recordings.items():

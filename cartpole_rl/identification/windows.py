@@ -91,7 +91,7 @@ def cut_windows(
     """Cut windows of `seconds` s, one after another, evenly thinned to at most `most`.
 
     A window over a lost or late frame is left out, and so is one that shares frames with `apart_from`. Raises
-    RecordingError if nothing is left, or if the recordings have another control period than `period` s.
+    RecordingError if nothing is left. `period`, s, is that of the recordings (`checks.shared_period`).
     """
     periods = round(seconds / period)
     pieces = [
@@ -114,7 +114,7 @@ def cut_stretches(episode: Episode, period: float, seconds: float, lead: int) ->
     """Cut a window of `lead` periods and `seconds` s at every `seconds` s of an episode.
 
     Positions are NaN from the first lost or late frame on; a window with such a frame in its lead is left
-    out. Raises RecordingError where nothing is left, or for another control period than `period` s.
+    out. Raises RecordingError where nothing is left.
     """
     periods = max(1, round(seconds / period))
     pieces = [*_pieces(episode, period, lead + periods, step=periods, least=lead + 1)]
@@ -132,7 +132,7 @@ def cut_judging(
     """Cut a window of `lead` periods and `seconds` s at every `seconds` s, and keep every JUDGING-th of them.
 
     Only those count in which the cart moves over `moving` m or more and no frame is lost or late.
-    Raises RecordingError where there are none, or for another control period than `period` s.
+    Raises RecordingError where there are none.
     """
     periods = round(seconds / period)
     pieces = [
@@ -153,9 +153,7 @@ def _pieces(
 ) -> Iterator[Windows]:
     """Yield single windows of `length` periods, every `step`, whose history and first `least` are known."""
     history, end = history_periods(period), episode.measured_steps
-    if end < least:  # the median of a few gaps tells no period
-        return
-    late = np.flatnonzero(~regular_frames(episode, period)[:end])
+    late = np.flatnonzero(~episode.regular_frames(period)[:end])
     last_known = np.append(late, end)  # rows after which the motion is not known
     before = np.zeros(history)
     if known_before := episode.motor_before[-history:]:
@@ -171,19 +169,6 @@ def _pieces(
             positions[: len(measured)] = measured
             driven = motors[first : first + history + length, None]
             yield Windows(positions[..., None], driven, np.array([number]), np.array([first]), resolution)
-
-
-def regular_frames(episode: Episode, period: float) -> NDArray[np.bool_]:
-    """Return for each control period, [T], whether the frame at its end came in time.
-
-    Raises RecordingError for a recording of another control period.
-    """
-    gaps = np.diff(episode.time)
-    if len(gaps) and abs(np.median(gaps) / period - 1) > IRREGULAR:
-        raise RecordingError(
-            f"a recording has a frame every {np.median(gaps) * 1e3:.1f} ms, not every {period * 1e3:.1f} ms"
-        )
-    return episode.regular_frames(period)
 
 
 def mean_gap(time: NDArray[np.float64]) -> float:
