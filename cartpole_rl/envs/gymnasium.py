@@ -163,17 +163,12 @@ class Carts:
                 raise ConfigError(f"{name}: give {instead} instead")
         self.env = simulated_environment(task, carts, period=period, time_limit=limit, **given)
         modes = [each for each in RENDER_MODES if each != "human" or has_display()]
-        self.metadata = {
-            **self.metadata,
-            "render_modes": modes,
-            "render_fps": round(1 / self.env.plant.period),
-        }
+        period = self.env.plant.period
+        self.metadata = {**self.metadata, "render_modes": modes, "render_fps": round(1 / period)}
         self.render_mode = mode
         if mode is not None:
             steps = MAX_EPISODE_STEPS if limit in (None, UNLIMITED) else limit
-            self.renderer = Renderer(
-                mode, self.env.plant, f"cartpole_rl {task}", self.env.plant.period, steps
-            )
+            self.renderer = Renderer(mode, self.env.plant, f"cartpole_rl {task}", period, steps)
 
     def spaces_of_one(self) -> tuple[spaces.Box, spaces.Discrete]:
         """Return the spaces of one cart: its observation, and an action as an index of its motor values."""
