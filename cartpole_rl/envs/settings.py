@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from functools import cache
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from pydantic import Discriminator, Field, Tag, field_validator
 
@@ -117,11 +117,10 @@ ControlPeriod = Annotated[float, Field(ge=SHORTEST_PERIOD, le=LONGEST_PERIOD)]
 class FrictionSettings(Settings):
     """A friction law, and numbers of the cart under it: see `driven_numbers`."""
 
-    if TYPE_CHECKING:
-        model: Law
-        parameters: dict[str, Finite]
+    model: Any  # a Law of one registry
+    parameters: dict[str, Finite]
 
-    @field_validator("parameters", mode="before", check_fields=False)
+    @field_validator("parameters", mode="before")
     @classmethod
     def _null_is_the_number_of_the_cart(cls, given: Any) -> Any:
         is_mapping = isinstance(given, Mapping)
@@ -132,14 +131,12 @@ class CartFrictionSettings(FrictionSettings):
     """The friction law of the cart."""
 
     model: Annotated[Law, CART_FRICTIONS]
-    parameters: dict[str, Finite]
 
 
 class PoleFrictionSettings(FrictionSettings):
     """The friction law of the pole."""
 
     model: Annotated[Law, POLE_FRICTIONS]
-    parameters: dict[str, Finite]
 
 
 @cache
