@@ -234,8 +234,7 @@ def check_resumable(program: str, resume: str, folder: Path) -> None:
     if has_ended(run):
         raise ConfigError(
             f"resume={run}: this run of {PREFIX}{program} has ended; cartpole-evaluate "
-            f"{as_word('run', run)} drives its "
-            f"agent, {LONGER[program].format(as_value(run))}"
+            f"{as_word('run', run)} drives its agent, {LONGER[program].format(as_value(run))}"
         )
     find_training(run)
 

@@ -20,7 +20,7 @@ from cartpole_rl.envs.settings import CartPoleSettings
 from cartpole_rl.errors import CheckpointError, RecordingError
 from cartpole_rl.evaluation.driving_policy import Weights, as_weights
 from cartpole_rl.evaluation.episodes import run_batch
-from cartpole_rl.identification.fit import Fit, best_fit
+from cartpole_rl.identification.fit import best_fit
 from cartpole_rl.identification.unknowns import LONGEST_LATENCY
 from cartpole_rl.identification.windows import NoWindowError, cut_windows
 from cartpole_rl.learning.agent import QAgent
@@ -225,9 +225,7 @@ class CartLearner:
         episode is too short for a fit, carts are drawn as in training. Raises RecordingError.
         """
         try:
-            fit, models = self.fit_simulator(recorded)
-            self.candidates = [models]
-            self.carts = self.draw_carts(fit)
+            models = self.fit_simulator(recorded)
         except NoWindowError as error:
             self.is_fitted = False
             self.show(f"the simulator is not fitted yet, its carts are drawn as in training: {error}")
@@ -278,9 +276,7 @@ class CartLearner:
         An episode that no cart drives, as with a loose encoder, leaves the earlier fit.
         """
         try:
-            fit, models = self.fit_simulator(self.recorded)
-            self.candidates = [models]
-            self.carts = self.draw_carts(fit)
+            models = self.fit_simulator(self.recorded)
         except RecordingError as error:
             self.show(f"the simulator stays as it is: {error}")
             return
@@ -328,23 +324,20 @@ class CartLearner:
             config.compile,
         )
 
-    def fit_simulator(self, recorded: Sequence[Episode]) -> tuple[Fit, Models]:
-        """Return the fit with the lowest cost among the candidate models, and its models."""
+    def fit_simulator(self, recorded: Sequence[Episode]) -> Models:
+        """Draw carts from the fit with the lowest cost; return its models, which stay the only candidates."""
         period = self.settings.control_period
         windows = cut_windows(recorded, period)
         poles = self.training.pole if self.config.plant.reads_emulator else self.settings.pole
         fit, models = best_fit(windows, self.training.nominal_with(poles.nominal), self.candidates, period)
         self.show(
             f"simulator fitted to {windows.number} windows of {windows.periods * period:g} s: RMS error "
-            f"{1e3 * fit.rms[0]:.2f} mm and "
-            f"{math.degrees(fit.rms[1]):.2f} deg"
+            f"{1e3 * fit.rms[0]:.2f} mm and {math.degrees(fit.rms[1]):.2f} deg"
         )
-        return fit, models
-
-    def draw_carts(self, fit: Fit) -> torch.Tensor:
-        """Return carts drawn from `fit`, [P, SAMPLES]."""
+        self.candidates = [models]
         random = np.random.default_rng(self.config.seed)
-        return torch.from_numpy(fit.draw(SAMPLES, random, self.config.finetuning.widen)).float()
+        self.carts = torch.from_numpy(fit.draw(SAMPLES, random, self.config.finetuning.widen)).float()
+        return models
 
     def randomizer(self) -> IdentifiedCarts:
         """Return the randomizer of the simulated carts: of the newest fit, and a share of the prior."""

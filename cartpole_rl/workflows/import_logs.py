@@ -277,8 +277,7 @@ def _delay_doubts(sensors: Sensors, period: float, layout: Layout) -> Iterator[s
     when = "too early" if early else f"over {1e3 * max(2 * period, LATE):g} ms later"
     yield (
         f"the motor values seem shifted: they move the cart {when} ({1e3 * delay.value:.0f} ms, 95 %: "
-        f"{1e3 * delay.low:.0f} to {1e3 * delay.high:.0f}, after the state of their row); "
-        f"{advice}"
+        f"{1e3 * delay.low:.0f} to {1e3 * delay.high:.0f}, after the state of their row); {advice}"
     )
 
 
