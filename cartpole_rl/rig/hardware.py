@@ -134,11 +134,11 @@ def hardware_of(cart: Mapping[str, float]) -> Hardware:
     """Return the hardware in a cart's file, ip02's where it gives none. Raises ConfigError."""
     given = {name: cart[name] for name in HARDWARE if name in cart}
     hardware = nominal_hardware() if not given else _hardware(tuple(given.items()))
-    end = cart.get("track_half_length", 0.0)
-    if end > hardware.half_span:
+    end, stop = cart.get("track_half_length", 0.0), hardware.half_span
+    if end > stop:
         raise ConfigError(
-            f"cart.track_half_length is {end:g} m, but the stops are {hardware.half_span:g} m from the middle "
-            f"by track_span; give at most {hardware.half_span - hardware.soft_limit:g} m, up to the soft limit"
+            f"cart.track_half_length is {end:g} m, but the stops are {stop:g} m from the middle by track_span; "
+            f"give at most {stop - hardware.soft_limit:g} m, up to the soft limit"
         )
     return hardware
 
