@@ -137,8 +137,8 @@ def hardware_of(cart: Mapping[str, float]) -> Hardware:
     end, stop = cart.get("track_half_length", 0.0), hardware.half_span
     if end > stop:
         raise ConfigError(
-            f"cart.track_half_length is {end:g} m, but the stops are {stop:g} m from the middle by track_span; "
-            f"give at most {stop - hardware.soft_limit:g} m, up to the soft limit"
+            f"cart.track_half_length is {end:g} m, but the stops are {stop:g} m from the middle by "
+            f"track_span; give at most {stop - hardware.soft_limit:g} m, up to the soft limit"
         )
     return hardware
 

@@ -145,7 +145,7 @@ def test_an_interrupted_reproduction_is_continued(done: Done) -> None:
 
 def test_a_failure_does_not_end_the_others(done: Done) -> None:
     assert done.failures == {
-        "toy/impossible/10": "cart_mass is -1; it must be above 0",
+        "toy/impossible/10": "cart_mass is -1; it must be above 0 and at most 100",
         "toy/impossible/10/evaluations/own": f"it needs {done.root}/toy/impossible/10, which failed",
     }
     assert re.match(r"6 runs, \d of them done; 2 at a time, in ", done.lines[0])
