@@ -299,8 +299,8 @@ def run_onboard_episodes(env: CartPoleEnv, policy: Policy, episodes: int) -> Ite
 
 @torch.no_grad()
 def run_onboard(env: CartPoleEnv, policy: Policy) -> Episode:
-    """Return an episode of the cart's board. `motor` is what the cart reports at the end of each period."""
-    plant, cart, steps, done = env.plant, env.one_cart, [], False
+    """Return an episode of the cart's board. `motor` is that of `SerialPlant.drove`."""
+    plant, cart, steps, motors, done = env.plant, env.one_cart, [], [], False
     assert isinstance(plant, SerialPlant)
     with no_garbage_collection(), on_board(plant):
         first = cart.reset()
@@ -309,6 +309,7 @@ def run_onboard(env: CartPoleEnv, policy: Policy) -> Episode:
             while not done:
                 frame = plant.listen_one()
                 step = cart.advance(frame.motor_applied[0], frame)
+                motors.append(plant.drove(frame.motor_applied[0]))
                 frames.append(frame)
                 stopped.append(bool(plant.cart.flags & (Flags.WATCHDOG | Flags.SOFT_LIMIT)))
                 steps.append(step)
@@ -319,9 +320,8 @@ def run_onboard(env: CartPoleEnv, policy: Policy) -> Episode:
     actions = [chosen_action(policy, percept.observation) for percept in percepts]
     chosen = np.array([cart.motor(action) for action in actions])
     expected = np.array([cart.guarded_motor(*pair) for pair in zip(actions, percepts, strict=True)])
-    motor = np.array([frame.motor_applied[0] for frame in frames[1:]])
     ending = ending_of(env, 0, steps[-1].truncated[0], steps[-1].state[2])
-    episode = one_episode(env, first, steps, frames, motor, expected != chosen, ending)
+    episode = one_episode(env, first, steps, frames, np.array(motors), expected != chosen, ending)
     gaps = np.array(stopped) | late(frames, plant.cart.information.period_us * 1e-6)
     compared = comparable(gaps[1:], memory(env.hardware.observation_settings), ending)
     return replace(episode, expected=expected[: episode.steps], compared=compared[: episode.steps])

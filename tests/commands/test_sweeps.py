@@ -19,7 +19,7 @@ def test_a_sweep_needs_no_dash_m_and_takes_values_of_the_command_line(tmp_path: 
     report = done.err.splitlines()[-5:]
     assert report[0] == f"cartpole-train: 4 of 4 jobs failed in {folder.relative_to(tmp_path)}:"
     assert report[1:] == [
-        f"cartpole-train: {number}_randomization-{width}: cart_mass is -1; it must be above 0"
+        f"cartpole-train: {number}_randomization-{width}: cart_mass is -1; it must be above 0 and at most 100"
         for number, width in enumerate(("none", "friction_6", "half", "wide"))
     ]
 

@@ -54,11 +54,11 @@ def test_motor_values_are_replaced() -> None:
 
 
 def test_an_agent_of_another_rig_is_refused() -> None:
-    training = load_settings(TrainConfig, {"cart.track_span": 0.5})
+    training = load_settings(TrainConfig, {"cart.track_span": 0.78})
     for run, refused in (("somewhere", True), ("lqr", False)):
         config = load_settings(EvaluateConfig, {"run": run, "cart": "ip02"})
         if refused:
-            with pytest.raises(ConfigError, match=r"0\.814 m of track, but .* 0\.5 m of track; train one"):
+            with pytest.raises(ConfigError, match=r"0\.814 m of track, but .* 0\.78 m of track; train one"):
                 replaced_settings(training, config)
         else:
             assert replaced_settings(training, config).hardware.track_span == 0.814

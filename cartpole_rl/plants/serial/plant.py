@@ -199,12 +199,7 @@ class SerialPlant(OneCartPlant):
                 raise
             took = self.cart.took_motor(state)
             if self.cart.flags & Flags.SOFT_LIMIT:
-                drove = state.motor_applied
-                limited = before & Flags.SOFT_LIMIT
-                if took and limited and drove == sent and abs(self._drove) == LARGEST_MOTOR:
-                    drove = self._drove
-                elif took and not limited and drove == 0:
-                    drove = sent
+                drove = self._under_limit(state, before, sent) if took else state.motor_applied
             elif not took:
                 has_just_stopped = state.fault or self.cart.flags & ~before & Flags.WATCHDOG
                 drove = self._drove if has_just_stopped else state.motor_applied
@@ -218,13 +213,26 @@ class SerialPlant(OneCartPlant):
         """Return the motor value that drove the newest period."""
         return self._drove
 
+    def _under_limit(self, state: State, before: Flags, sent: int) -> int:
+        """Return the motor value that drove most of a period in which a limit of the track acted.
+
+        `before` are the flags of the state before, `sent` is the value that the cart would have held.
+        """
+        if not before & Flags.SOFT_LIMIT:
+            return state.motor_applied or sent
+        has_let_go = state.motor_applied == sent and abs(self._drove) == LARGEST_MOTOR
+        return self._drove if has_let_go else state.motor_applied
+
     def listen_one(self) -> PlantOutput[Numbers]:
         """Let the policy on the board drive; return the frame at the end of the period."""
 
         def listen() -> State:
             if self.on_command is not None:
                 self.on_command(self._state.motor_applied)
-            return self.cart.follow_policy()
+            before, state = self.cart.flags, self.cart.follow_policy()
+            applied, limited = state.motor_applied, self.cart.flags & Flags.SOFT_LIMIT
+            self._drove = self._under_limit(state, before, applied) if limited else applied
+            return state
 
         return self._pass_period(listen)
 
