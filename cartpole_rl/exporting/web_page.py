@@ -26,7 +26,7 @@ from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.serial.cart import LEASE_RENEWAL_US, LONGEST_STOP, LONGEST_SUSPENSION
 from cartpole_rl.plants.serial.connection import ACKNOWLEDGED_STOPS, LONGEST_DEAFNESS, ROUND_TRIPS
 from cartpole_rl.plants.serial.errors import FAULTS, REASONS, limit_range
-from cartpole_rl.plants.serial.preparation import POSITIONS, STILL_SECONDS
+from cartpole_rl.plants.serial.preparation import OFF_CENTRE, POSITIONS, STILL_SECONDS
 from cartpole_rl.plants.serial.tracking import OVERTAKEN_TICKS
 from cartpole_rl.plants.settings import SerialSettings, SimulationSettings
 from cartpole_rl.plants.simulated import Carts, Inputs, Period, commands_under_way, encoder_counts, run_carts
@@ -209,6 +209,7 @@ def wire(settings: CartPoleSettings) -> dict[str, Any]:
         "needsLength": settings.observation.pole_length,
         "start": asdict(position),
         "still": STILL_SECONDS,
+        "offCentre": hardware.encoders.cart_counts(OFF_CENTRE * hardware.half_span),
         "stops": ACKNOWLEDGED_STOPS,
         "lease": LEASE_RENEWAL_US,
         "overtaken": OVERTAKEN_TICKS,

@@ -251,10 +251,14 @@ def test_trouble_ends_it_with_one_line(
     [
         ("window.dispatchEvent(new KeyboardEvent('keydown', { key: 'Escape' }));", "Stopped by hand."),
         (SILENT, "No state came for 0.3 s"),
+        (
+            "WIRE.offCentre = -1; WIRE.startTimeout = 1;",
+            "The cart is off the middle of its track: bring it back",
+        ),
     ],
-    ids=["escape", "silence"],
+    ids=["escape", "silence", "off the middle"],
 )
-def test_homing_ends_early(page: str, tmp_path: Path, event: str, words: str) -> None:
+def test_no_episode_begins(page: str, tmp_path: Path, event: str, words: str) -> None:
     script = f"{AGREED} await until(() => real.newest.flags & WIRE.flags.HOMING); {event} {ENDED}"
     line, _ = answer(page, script, tmp_path)
     assert line.startswith(words)

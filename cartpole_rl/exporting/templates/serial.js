@@ -375,11 +375,13 @@ class SerialCart {
     for (let state = began; !still.length || seconds(still[0], state) < WIRE.still; ) {
       this.send("HELLO");
       state = await this.seen();
-      if (seconds(began, state) > WIRE.startTimeout) throw new Error(`the pole was not still in time: ${remedy}`);
+      const away = Math.abs(state.cart_counts) > WIRE.offCentre;
+      const late = away ? "the cart is off the middle of its track: bring it back" : `the pole was not still in time: ${remedy}`;
+      if (seconds(began, state) > WIRE.startTimeout) throw new Error(late);
       const theta = this.cart.motion[2];
       still.push({ time_us: state.time_us, theta });
       const angles = still.map((each) => each.theta), spread = Math.max(...angles) - Math.min(...angles);
-      if (Math.abs(wrapped(theta - angle)) > tolerance || spread > sway) still = [];
+      if (away || Math.abs(wrapped(theta - angle)) > tolerance || spread > sway) still = [];
     }
   }
 
