@@ -27,7 +27,7 @@ FINE = 2000  # counts a turn: a pole that is balanced may stay within one coarse
 STILL = 0.5  # s, if the count does not change for as long after it
 LEANING = 0.025 + 0.008  # rad: largest error of the encoder's zero, and what friction holds
 FALLEN = np.radians(10)  # rad: near enough to upright
-BLIND = 0.03  # m that a cart has moved by its file while its count stood
+BLIND, LATE = 0.015, 3  # m that a cart has moved by its file while its count stood, for more periods
 HALF = 0.5  # s, over which a pole of up to 1.4 m multiplies its angle by 2.7 or more
 LATCHED = Fault.CART_ENCODER | Fault.STALL, Fault.POLE_ENCODER  # a dead cart encoder can show as a STALL
 
@@ -77,6 +77,7 @@ class BlindMotion:
         self._acceleration = 1 / (hardware.motor_per_newton * hardware.moving_mass)  # m/s^2 a motor value
         self._count: int | None = None
         self._speed = self._way = 0.0  # m/s, m: estimated since the count stands
+        self._periods = 0  # for which it stands
 
     def is_seen(self, motor: int, count: int, passed: float) -> bool:
         """Return True if the cart must have moved under its last motor values, which lasted `passed` s each.
@@ -84,13 +85,14 @@ class BlindMotion:
         `count` is that of the cart after them. To and fro by one is no change of it.
         """
         if self._count is None or abs(count - self._count) > 1:
-            self._count, self._speed, self._way = count, 0.0, 0.0
+            self._count, self._speed, self._way, self._periods = count, 0.0, 0.0, 0
         push = max(0.0, abs(motor) - self._breakaway)
         self._speed += math.copysign(push, motor) * self._acceleration * passed
         if not push:
             self._speed = 0.0
         self._way += self._speed * passed
-        return abs(self._way) > BLIND
+        self._periods += 1
+        return abs(self._way) > BLIND and self._periods > LATE  # what was sent last may not have acted yet
 
 
 def last_change(count: NDArray[np.int64], open_wire: bool) -> int:

@@ -29,7 +29,17 @@ from cartpole_rl.reporting.runs import (
 )
 from cartpole_rl.reporting.statistics import interquartile_mean
 from cartpole_rl.reporting.texts import SCORES, count_text
-from cartpole_rl.run_folder import BASELINE, CART, COMPARISON, POLE, PREFIX, PRETRAINED, RANDOMIZATION, USES
+from cartpole_rl.run_folder import (
+    BASELINE,
+    CART,
+    COMPARISON,
+    POLE,
+    PREFIX,
+    PRETRAINED,
+    RANDOMIZATION,
+    USES,
+    is_own_policy,
+)
 
 MOST_MEASURES = 20  # in a message
 MOST_UNSORTED = 12  # groups that are shown in the order of their runs
@@ -436,10 +446,9 @@ def _seeds(seeds: set[int]) -> str:
 def _untraced(sweep: Sweep) -> list[str]:
     """Return a note on agents whose own runs are not there."""
     named = {member.run.agent for member in sweep.members if member.agent is None} - {"", str(BASELINE)}
-    lost = [agent for agent in named if Path(agent).parts[:1] != (PRETRAINED,)]
-    return (
-        [f"The runs of {count_text(len(lost), 'agent')} were not found and are not checked."] if lost else []
-    )
+    runs = [run for run in map(Path, named) if not is_own_policy(run) and run.parts[:1] != (PRETRAINED,)]
+    lost = count_text(len(runs), "agent")
+    return [f"The runs of {lost} were not found and are not checked."] if runs else []
 
 
 def _check_measure(sweeps: Sequence[Sweep], measure: str) -> None:
