@@ -33,6 +33,7 @@ LEAST_SAMPLES, LEAST_OF_A_SIGN = 200, 50  # of motion, for an estimate and for a
 SAMPLES = 20  # of the bootstrap
 PIECE = 100  # rows of a recording that are drawn together
 SWINGING = 1.0  # rad of the pole that tell its scale
+UNEXPLAINED = 0.25  # share of the acceleration of a pole that moves little; beyond it, noise may turn gravity
 NUMEROV = np.array((1, 10, 1)) / 12  # the mean of an acceleration over which a second difference extends
 EARLIEST, LATEST = 2, 4  # periods before and after its row in which a motor value may come into force
 AT_ONCE = (-1.0, -0.5, 0.0, 0.5, 1.0)  # periods, delays at which a motor value shows its sign
@@ -71,7 +72,7 @@ class Sensors(NamedTuple):
     angle_zero: Estimate | None  # rad, recorded angle of the upright pole
     position_scale: Estimate | None  # true over recorded position
     delay: Estimate | None  # s from a row's state until its motor value moves the cart
-    falls_upwards: bool  # gravity pulls the pole towards the recorded upright: the angle is half a turn off
+    falls_upwards: bool | None  # gravity pulls the pole to the recorded upright: the angle is half a turn off
     push: float  # `Samples.response`: negative means a wrong sign
     lag: float  # `Samples.lag`, with the angle from upright: negative means a wrong sign
 
@@ -115,15 +116,21 @@ class Samples:
         return max(float(np.ptp(motion.theta)) for motion in self._motions) > SWINGING
 
     @property
-    def falls_upwards(self) -> bool:
-        """True if gravity pulls the pole towards its recorded upright, whatever the unit of the angle."""
-        if not (self.moves and self.swings):
-            return False
+    def falls_upwards(self) -> bool | None:
+        """True if gravity pulls the pole towards its recorded upright, whatever the unit of the angle.
+
+        None if the motion does not tell: noise lowers the coefficient of gravity, and turns its sign if the
+        pole moves little.
+        """
+        if not self.moves:
+            return None
         fits = []
         for scale in SCALES:
             solution, errors = _regression(self.pole_terms(scale), scale * self.theta_ddot, None)
             fits.append((float(errors.std()) / scale, float(solution[0])))
-        return min(fits)[1] < 0
+        unexplained, gravity = min(fits)
+        known = self.swings or unexplained < UNEXPLAINED * float(self.theta_ddot.std())
+        return gravity < 0 if known else None
 
     def _second_difference(self, values: Array) -> Array:
         return np.convolve(values, (1, -2, 1), "same") / self._period**2
@@ -178,7 +185,7 @@ def question_sensors(
     """
     samples = samples_of(motions, period)
     if samples is None:
-        return Sensors(None, None, None, None, False, 0.0, 0.0)
+        return Sensors(None, None, None, None, None, 0.0, 0.0)
     dice = np.random.default_rng(0)
     upwards = samples.falls_upwards
     scale = zero = position = delay = None

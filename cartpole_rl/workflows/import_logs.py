@@ -162,9 +162,10 @@ def doubts(reports: Sequence[Report], sensors: Sensors, period: float, layout: L
             "layout.motor.positive or layout.position.positive"
         )
     elif sensors.lag < -CORRELATED:
+        half_a_turn = ", or mend layout.angle.upright, which may be half a turn off"
         yield (
             "the pole runs ahead of its cart instead of staying behind: give the other side for "
-            "layout.angle.positive"
+            f"layout.angle.positive{half_a_turn if sensors.falls_upwards is None else ''}"
         )
     rows, leaps = sum(each.rows for each in reports), sum(each.leaps for each in reports)
     if leaps > LEAPS * rows:

@@ -78,6 +78,24 @@ def driven_pole(most: int, late: int = 10, balanced: bool = False) -> Columns:
     return {"t": PERIOD * np.arange(STEPS), "x": positions[:, 0], "a": positions[:, 1], "u": motor}
 
 
+@pytest.fixture(scope="module")
+def balanced() -> Columns:
+    """A pole within 0.2 rad of upright, by the same equation, under feedback and random pushes."""
+    fine, gains = 20, np.array((400, 800, 2200, 400))
+    pushes = np.repeat(np.random.default_rng(5).integers(-100, 101, STEPS // 25), 25)
+    state, step, motor, rows = np.array((0, 0, 0.1, 0)), PERIOD / fine, [], []
+    for index in range(STEPS):
+        rows.append(state[[0, 2]])
+        motor.append(float(np.clip(np.rint(gains @ state) + pushes[index], -255, 255)))
+        for _ in range(fine):
+            x, x_dot, theta, theta_dot = state
+            x_ddot = 0.03 * motor[index] - 8 * x_dot
+            theta_ddot = (9.81 * np.sin(theta) - x_ddot * np.cos(theta)) / LENGTH - 0.1 * theta_dot
+            state = state + step * np.array((x_dot, x_ddot, theta_dot, theta_ddot))
+    x, theta = np.array(rows).T
+    return {"t": PERIOD * np.arange(STEPS), "x": x, "a": theta, "u": np.array(motor)}
+
+
 def written(
     path: Path,
     columns: Columns,
@@ -544,6 +562,36 @@ def test_each_fault_of_a_log_is_a_doubt(
     alone = "time", "half a turn", "position.positive", "more often"
     if any(each in expected[0] for each in alone):  # nothing else is wrong
         assert len(doubts) == len(expected)
+
+
+OF_BALANCED: dict[str, tuple[Callable[[Columns], Columns], float, str]] = {
+    "as it is": (lambda each: each, 0, ""),
+    "noisy": (lambda each: each, 2, ""),
+    "hanging at 0": (lambda each: {**each, "a": each["a"] + np.pi}, 0, "pole falls upwards.*half a turn off"),
+    "angle sign": (lambda each: {**each, "a": -each["a"]}, 0, "pole runs ahead.*for layout.angle.positive$"),
+    "noisy, hanging at 0": (
+        lambda each: {**each, "a": each["a"] + np.pi},
+        0.3,
+        "runs ahead.*layout.angle.positive, or mend layout.angle.upright, which may be half a turn off$",
+    ),
+}
+
+
+@pytest.mark.parametrize(("convert", "noise", "expected"), OF_BALANCED.values(), ids=OF_BALANCED)
+def test_a_balanced_pole_tells_half_a_turn_from_a_wrong_side(
+    tmp_path: Path,
+    balanced: Columns,
+    convert: Callable[[Columns], Columns],
+    noise: float,
+    expected: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """With noise, in degrees, gravity seems to pull the wrong way, and says nothing."""
+    columns, errors = convert(balanced), np.radians(noise) * np.random.default_rng(1).normal(size=STEPS)
+    path = written(tmp_path / "log.csv", {**columns, "a": columns["a"] + errors})
+    import_logs(imported(path), tmp_path / "run")
+    doubts = re.findall("doubt: (.*)", capsys.readouterr().out)
+    assert [re.search(expected, each) is not None for each in doubts] == [True] * bool(expected), doubts
 
 
 def test_logs_of_several_periods_are_refused(tmp_path: Path, motion: Columns) -> None:
