@@ -18,7 +18,7 @@ from cartpole_rl.checking import validated
 from cartpole_rl.choices import choice, is_shipped
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.evaluation.recordings import read_recording, write_recording
+from cartpole_rl.evaluation.recordings import LENGTH, read_recording, write_recording
 from cartpole_rl.files import replacing, write_text
 from cartpole_rl.identification.checks import check_recordings, check_same_encoders, shared_period
 from cartpole_rl.identification.experiments import EXPERIMENTS, HELD_OUT, conduct, experiment_guard
@@ -51,6 +51,7 @@ from cartpole_rl.run_folder import (
     RANDOMIZATION,
     RECORDINGS,
     experiments,
+    program_of,
     write_config,
     write_json,
 )
@@ -66,11 +67,12 @@ from cartpole_rl.terminal import (
     words_given,
 )
 from cartpole_rl.workflows.build import precedence, use_threads
-from cartpole_rl.workflows.checks import note_other_numbers
-from cartpole_rl.workflows.config import IdentifyConfig
+from cartpole_rl.workflows.checks import is_given, note_other_numbers
+from cartpole_rl.workflows.config import IdentifyConfig, recorded_settings
 from cartpole_rl.workflows.poles import warn_of_another_pole
 
 CLOCK = 1e-3  # share by which a clock and the rounding of `shared_period` may change the period
+OF_CART = ("cart", "pole", "control_period")  # settings that belong to recordings
 HELD_OUT_OF = 5  # one recording in so many is held out
 UNIDENTIFIABLE = {  # randomized about the identified cart, since no experiment shows them
     "track_half_length": {"distribution": "uniform", "relative": [-0.1, 0.0]},
@@ -85,8 +87,11 @@ SAME = ("cart_mass", "pole_mass", "pole_com", "cart_viscous", "pole_viscous")  #
 Episodes = dict[str, Episode]  # by the name of the experiment, or of the file
 
 
-def identify_cart(config: IdentifyConfig, folder: Path) -> None:
+def identify_cart(config: IdentifyConfig, folder: Path, words: Sequence[str] | None = None) -> None:
     """Identify the cart of `config.plant`, or that of the recordings in `config.source`.
+
+    If `config.source` is a run of this command, its settings of OF_CART hold unless the `words` of a command
+    line give others.
 
     Writes into `folder` config.yaml, provenance.json, recordings/ of experiments, cart.yaml, pole.yaml,
     randomization.yaml and posterior.npz (to train on), identification.json, page.html and figures/; with
@@ -95,6 +100,8 @@ def identify_cart(config: IdentifyConfig, folder: Path) -> None:
     that already holds a run, PlantError and LinkError for a cart that fails.
     """
     use_threads(config.threads)
+    if words is not None:
+        config = as_recorded(config, words)
     nominal = config.nominal  # or ConfigError, before the cart moves
     note_other_numbers("identify", config.nominal_cart, [config.pole.nominal])
     source = config.source or folder
@@ -156,6 +163,21 @@ def identify_cart(config: IdentifyConfig, folder: Path) -> None:
     print_verdict(found, folder)
 
 
+def as_recorded(config: IdentifyConfig, words: Sequence[str]) -> IdentifyConfig:
+    """Return `config` with the settings of OF_CART of the run that it reads, but those that `words` give."""
+    if config.source is None or program_of(config.source) != "identify":
+        return config
+    given, recorded = config.model_dump(mode="json", by_alias=True), recorded_config(config.source)
+    taken = {
+        name: recorded[name]
+        for name in OF_CART
+        if name in recorded and recorded[name] != given[name] and not is_given([name], words)
+    }
+    if taken:
+        print_message("identify", f"note: {' and '.join(taken)} as in from={config.source}")
+    return recorded_settings(IdentifyConfig, {**given, **taken}, f"from={config.source}")
+
+
 def regress(
     episodes: Sequence[Episode],
     nominal: Mapping[str, float],
@@ -188,7 +210,11 @@ def record_experiments(config: IdentifyConfig, folder: Path) -> None:
     ):
         progress.set_postfix_str(EXPERIMENTS[0].name, refresh=False)
         for number, (experiment, episode) in enumerate(conduct(plant, config.control_period, config.seed)):
-            header = {"experiment": experiment.name, "control_period_s": config.control_period}
+            header = {
+                "experiment": experiment.name,
+                LENGTH: config.pole.nominal.length,
+                "control_period_s": config.control_period,
+            }
             write_recording(folder / f"{number:02d}_{experiment.name}.csv", episode, header)
             following = EXPERIMENTS[number + 1 : number + 2]
             progress.set_postfix_str(following[0].name if following else "", refresh=False)
@@ -352,13 +378,22 @@ def known_truth(config: IdentifyConfig) -> EmulatorSettings | None:
     """Return the truth of the emulated cart that the recordings are of; None for any other cart."""
     if config.source is None:
         return config.emulator.of_cart(config.cart) if config.plant.reads_emulator else None
+    recorded = recorded_config(config.source)
     try:
-        recorded = yaml.safe_load((config.source / CONFIG).read_text(encoding="utf-8"))
         of_emulator = recorded["plant"]["kind"] == "emulated"
         truth = validated(EmulatorSettings, recorded["emulator"])
         return truth.of_cart(recorded["cart"]) if of_emulator else None
-    except (OSError, yaml.YAMLError, LookupError, TypeError, ConfigError):  # recordings of another origin
+    except (LookupError, TypeError, ConfigError):  # recordings of another origin
         return None
+
+
+def recorded_config(run: Path) -> dict[str, Any]:
+    """Return the content of config.yaml in a run folder; empty if it is missing or damaged."""
+    try:
+        recorded = yaml.safe_load((run / CONFIG).read_text(encoding="utf-8"))
+    except (OSError, ValueError, yaml.YAMLError):
+        return {}
+    return recorded if isinstance(recorded, dict) else {}
 
 
 def errors(

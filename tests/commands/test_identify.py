@@ -75,6 +75,28 @@ def test_offline_is_as_online(run: Path, results: dict[str, Any], tmp_path: Path
     assert json.loads((tmp_path / "again/identification.json").read_text()) == results
 
 
+def test_recordings_of_a_run_are_of_its_cart_and_its_pole(run: Path, tmp_path: Path) -> None:
+    """Also where the command that reads them does not repeat cart= and pole=."""
+    assert {read_recording(path).pole_length for path in (run / "recordings").iterdir()} == {0.3556}
+    shutil.copytree(run, tmp_path / "first")
+    recorded = yaml.safe_load((run / "config.yaml").read_text())
+    recorded["cart"] |= {"track_half_length": 0.3}
+    recorded["pole"]["choices"] = {"mine": {"pole_mass": 0.2, "pole_com": 0.18, "pole_inertia": 0.002}}
+    (tmp_path / "first/config.yaml").write_text(yaml.safe_dump(recorded))
+    for folder, word, taken in (
+        ("same", "label=", {"cart", "pole"}),
+        ("other", "pole=medium", {"cart"}),
+        ("changed", "cart.cart_mass=0.8", {"pole"}),
+    ):
+        done = in_process(
+            "identify", "from=first", "method=one_step", word, f"hydra.run.dir={folder}", folder=tmp_path
+        )
+        assert done.code == 0, done.err
+        used = yaml.safe_load((tmp_path / folder / "config.yaml").read_text())
+        assert {name for name in ("cart", "pole") if used[name] == recorded[name]} == taken
+        assert f"note: {' and '.join(sorted(taken))} as in from=first" in done.err
+
+
 def test_the_cart_is_fitted_with_the_period_of_its_recordings(run: Path, tmp_path: Path) -> None:
     """Of 20.3 ms, which is near enough to the setting of 20 ms not to be refused."""
     for path in (run / "recordings").iterdir():
