@@ -20,7 +20,12 @@ from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.recordings import LENGTH, read_recording, write_recording
 from cartpole_rl.files import replacing, write_text
-from cartpole_rl.identification.checks import check_recordings, check_same_encoders, shared_period
+from cartpole_rl.identification.checks import (
+    SHORTEST_HELD_OUT,
+    check_recordings,
+    check_same_encoders,
+    shared_period,
+)
 from cartpole_rl.identification.experiments import EXPERIMENTS, HELD_OUT, conduct, experiment_guard
 from cartpole_rl.identification.identify import Identification, identify, intervals, no_force_up_to
 from cartpole_rl.identification.one_step import one_step_estimates
@@ -233,18 +238,27 @@ def make_plant(config: IdentifyConfig) -> SerialPlant:
 def split(recordings: Episodes) -> tuple[Episodes, Episodes]:
     """Return the recordings to fit, and the held-out ones.
 
-    Held out are the experiment of that name, or else every fifth recording, or the last of fewer than five,
-    or the last fifth of a single one.
+    Held out are the experiment of that name, or else every fifth recording, or the last of fewer than five.
+    If they are too short to judge a fit, they are chosen among the long ones. Of a single one, or a single
+    long one, the last fifth is held out.
     """
-    names = list(recordings)
-    if len(names) == 1:
-        (episode,) = recordings.values()
-        end = episode.steps - episode.steps // HELD_OUT_OF
-        rest = episode.part(end, episode.steps)
-        return {names[0]: episode.part(0, end)}, {f"the last fifth of {names[0]}": rest}
-    held_out = [HELD_OUT] if HELD_OUT in recordings else names[HELD_OUT_OF - 1 :: HELD_OUT_OF] or names[-1:]
-    fitted = {name: episode for name, episode in recordings.items() if name not in held_out}
-    return fitted, {name: recordings[name] for name in held_out}
+    held_out = [HELD_OUT] if HELD_OUT in recordings else some_of([*recordings])
+    seconds = {name: float(np.ptp(episode.time)) for name, episode in recordings.items()}
+    if HELD_OUT not in held_out and sum(seconds[name] for name in held_out) < SHORTEST_HELD_OUT:
+        held_out = some_of([name for name in recordings if seconds[name] >= SHORTEST_HELD_OUT])
+    if held_out:
+        fitted = {name: episode for name, episode in recordings.items() if name not in held_out}
+        return fitted, {name: recordings[name] for name in held_out}
+    longest = max(seconds, key=lambda name: seconds[name])
+    episode = recordings[longest]
+    end = episode.steps - episode.steps // HELD_OUT_OF
+    rest = {f"the last fifth of {longest}": episode.part(end, episode.steps)}
+    return {**recordings, longest: episode.part(0, end)}, rest
+
+
+def some_of(names: Sequence[str]) -> Sequence[str]:
+    """Return every fifth of the names, or the last of fewer than five; none of a single one."""
+    return names[HELD_OUT_OF - 1 :: HELD_OUT_OF] or names[1:][-1:]
 
 
 def next_command(found: Identification, folder: Path) -> str:

@@ -14,8 +14,12 @@ from command_line import ONCE, QUICK, TINY, Outcome, in_process
 from cartpole_rl.checking import validated
 from cartpole_rl.composition import without_missing
 from cartpole_rl.evaluation.recordings import read_recording, write_recording
+from cartpole_rl.identification.experiments import recording
 from cartpole_rl.physics.parameters import CartParameters
+from cartpole_rl.rig.hardware import nominal_encoders
+from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.config import TrainConfig
+from cartpole_rl.workflows.identify import split
 
 
 @pytest.fixture(scope="module")
@@ -95,6 +99,30 @@ def test_recordings_of_a_run_are_of_its_cart_and_its_pole(run: Path, tmp_path: P
         used = yaml.safe_load((tmp_path / folder / "config.yaml").read_text())
         assert {name for name in ("cart", "pole") if used[name] == recorded[name]} == taken
         assert f"note: {' and '.join(sorted(taken))} as in from=first" in done.err
+
+
+@pytest.mark.parametrize(
+    ("seconds", "held_out"),
+    [
+        ([30, 6], ["1"]),
+        ([30, 2], ["the last fifth of 0"]),
+        ([2, 30], ["1"]),
+        ([30, 25, 2], ["1"]),
+        ([9, 9, 9, 9, 6, 9], ["4"]),
+        ([9, 9, 9, 9, 2, 9], ["5"]),
+        ([2, 40, 2, 2, 2], ["the last fifth of 1"]),
+        ([40], ["the last fifth of 0"]),
+    ],
+)
+def test_recordings_that_are_long_enough_are_held_out(seconds: list[int], held_out: list[str]) -> None:
+    def moving(rows: int) -> Episode:
+        counts = np.zeros((rows + 1, 2), np.int64)
+        return recording(counts, np.full(rows, 0.02), np.zeros(rows, np.int64), "time", nominal_encoders())
+
+    recordings = {str(number): moving(50 * each) for number, each in enumerate(seconds)}
+    fitted, judges = split(recordings)
+    assert [*judges] == held_out
+    assert sum(each.steps for each in (*fitted.values(), *judges.values())) == 50 * sum(seconds)
 
 
 def test_the_cart_is_fitted_with_the_period_of_its_recordings(run: Path, tmp_path: Path) -> None:
