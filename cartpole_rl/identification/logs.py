@@ -29,6 +29,7 @@ SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 TURN = {"rad": 2 * np.pi, "deg": 360.0, "turn": 1.0}
 FASTEST = 5.0  # m/s: no cart is faster
+LEAP, SMALL_LEAP = 0.25, 0.05  # turns beside whole ones between two rows; the latter where it is over a turn
 TURNING, STALE = 0.05 / (2 * np.pi), 1 / 3  # turns in three rows; share of such rows that repeat their states
 MOST_COUNTS = 2**31 - 1  # of an encoder, as in recordings
 NUMBERS = re.compile(r"(?=.*\d)([-+.,;:|\s\dEe]|nan|inf)+", re.IGNORECASE)  # a row of them
@@ -50,7 +51,8 @@ class Report(NamedTuple):
     gaps: int  # places where rows are missing
     saturated: int  # rows with full motor
     beyond: int  # rows with a motor value beyond full
-    leaps: int  # rows in which the angle differs by over a quarter of a turn from the row before
+    leaps: int  # rows to which no pole turns from the row before
+    leap: str  # the first of them
     jumps: int  # rows to which the cart would be faster than FASTEST
     stale: float  # share of the rows of a turning pole that have the states of the row before
     period: float  # s
@@ -112,7 +114,10 @@ def cut_log(read: Rows, layout: Layout, encoders: Encoders, period: float) -> Lo
     x = signed(layout.position.positive) * (columns[layout.position.name] - layout.position.zero)
     x *= METRES[layout.position.unit] if isinstance(layout.position.unit, str) else layout.position.unit
     turn = TURN[layout.angle.unit] if isinstance(layout.angle.unit, str) else layout.angle.unit
-    theta = signed(layout.angle.positive) * (columns[layout.angle.name] - layout.angle.upright) / turn
+    angle = columns[layout.angle.name]
+    if not isinstance(layout.angle.wraps, bool):
+        angle = np.unwrap(angle, period=layout.angle.wraps)
+    theta = signed(layout.angle.positive) * (angle - layout.angle.upright) / turn
     motor = signed(layout.motor.positive) * columns[layout.motor.name] / layout.motor.full
     counted, left_out = np.ones(len(time), bool), {UNKNOWN: read.unknown, TWICE: read.repeated}
     for name, (low, high) in layout.keep.items():
@@ -124,6 +129,9 @@ def cut_log(read: Rows, layout: Layout, encoders: Encoders, period: float) -> Lo
     else:
         regular = np.abs(gaps - period) <= UNEVEN * period
     together = counted[:-1] & counted[1:] & regular
+    turned = np.abs(np.diff(theta))
+    beside = np.abs((turned + 0.5) % 1 - 0.5)  # what is left of whole turns
+    leaps = np.flatnonzero(together & ((beside > LEAP) | ((turned > 1 + LEAP) & (beside > SMALL_LEAP)))) + 1
     edges = np.flatnonzero(np.diff(np.concatenate(([False], together, [False]))))
     parts = []
     for first, last in edges.reshape(-1, 2):  # rows, the last one included
@@ -163,7 +171,8 @@ def cut_log(read: Rows, layout: Layout, encoders: Encoders, period: float) -> Lo
         int((~regular).sum()),
         int((np.abs(motor) >= 0.999).sum()),
         int((np.abs(motor) > 1.001).sum()),
-        int((np.abs((np.diff(theta) + 0.5) % 1 - 0.5) > 0.25).sum()),
+        len(leaps),
+        f"row {leaps[0] + 1} of {path.name}" if len(leaps) else "",
         int((np.abs(np.diff(x)) > FASTEST * gaps).sum()),
         stale_share(x, theta),
         period,

@@ -193,6 +193,7 @@ def question_sensors(
         found = angle_estimates(samples, dice, on_step)
         known = (each.high - each.low < widest for each, widest in zip(found, WIDEST, strict=True))
         scale, zero, position = (each if sure else None for each, sure in zip(found, known, strict=True))
+        scale, position = (each if each and each.low > 0 else None for each in (scale, position))
         zero = None if upwards else zero
     if samples.moves and samples.push(0).std() > 0:
         delay = delay_estimate(samples, period, dice, on_step)

@@ -52,7 +52,7 @@ class AngleColumn(Settings):
     unit: Literal["rad", "deg", "turn"] | Positive = "rad"  # or units of the column in one turn
     positive: Direction = "right"  # the side to which the upright pole leans where the value increases
     upright: Finite = 0.0  # value of the upright pole
-    wraps: bool = True  # the value jumps by a turn somewhere
+    wraps: bool | Positive = True  # the value jumps by a turn somewhere, or by so many units of the column
 
 
 class MotorColumn(Settings):

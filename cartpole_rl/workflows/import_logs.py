@@ -47,7 +47,8 @@ EARLY = 0.25  # periods by which a delay may be estimated too early; a shifted r
 FINER = 0.8  # share of the time between rows: a shorter period of a resampled log is invented
 LATE = 0.05  # s, or two periods: a cart that takes longer is unusual
 RESAMPLED = 5e-4  # s between rows from which a log may be so fast
-LEAPS = 0.02  # share of rows
+LEAPS = 0.02  # share of rows; with a longer period than QUICK a pole may turn so far between two rows
+QUICK = 0.02 * (1 + SAME)  # s
 SATURATED = 0.5  # share of rows
 
 
@@ -90,6 +91,8 @@ def import_logs(config: ImportConfig, folder: Path) -> Sensors | None:
         sensors = question_sensors(
             motions(parts if period <= LONGEST_PERIOD else []), period, on_step=bar.update
         )
+    if angle_leaps(reports, period):  # then it tells nothing, and nor does what is estimated with it
+        sensors = Sensors(None, None, None, None, None, sensors.push, 0.0)
     found = [*doubts(reports, sensors, period, config.layout)]
     write_config(folder, "import", {**config.model_dump(mode="json", by_alias=True), "seed": 0})
     stems = Counter(path.stem for path in logs)
@@ -167,11 +170,14 @@ def doubts(reports: Sequence[Report], sensors: Sensors, period: float, layout: L
             "the pole runs ahead of its cart instead of staying behind: give the other side for "
             f"layout.angle.positive{half_a_turn if sensors.falls_upwards is None else ''}"
         )
-    rows, leaps = sum(each.rows for each in reports), sum(each.leaps for each in reports)
-    if leaps > LEAPS * rows:
-        yield (
-            f"the angle leaps over a quarter of a turn in {leaps} of {rows} rows: mend layout.angle.unit; "
-            "the column may be in degrees"
+    rows = sum(each.rows for each in reports)
+    if leaps := angle_leaps(reports, period):
+        first = next(each.leap for each in reports if each.leaps)
+        yield f"the angle leaps in {leaps} of {rows} rows, first in {first}: " + (
+            "mend layout.angle.unit; the column may be in degrees"
+            if leaps > LEAPS * rows
+            else "if its counter begins anew there, give its number of values as layout.angle.wraps, such as "
+            "65536; if not, leave these rows out by layout.keep"
         )
     if jumps := sum(each.jumps for each in reports):
         yield (
@@ -195,6 +201,12 @@ def doubts(reports: Sequence[Report], sensors: Sensors, period: float, layout: L
     saturated = sum(each.saturated for each in reports)
     if saturated > SATURATED * rows:
         yield f"{saturated} of {rows} rows have full motor: the motor's curve cannot be told from them"
+
+
+def angle_leaps(reports: Sequence[Report], period: float) -> int:
+    """Return in how many rows the angle leaps; 0 for a few of a long period."""
+    leaps = sum(each.leaps for each in reports)
+    return leaps if period <= QUICK or leaps > LEAPS * sum(each.rows for each in reports) else 0
 
 
 def _time_doubts(reports: Sequence[Report], period: float, layout: Layout) -> Iterator[str]:

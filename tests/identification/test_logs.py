@@ -225,6 +225,7 @@ def test_a_log_of_arrays_is_as_one_of_text(tmp_path: Path, motion: Columns, kind
             lambda each: {**each, "a": (1000 - each["a"] / (2 * np.pi) * 4271) % 4271},
             {"angle": {"unit": 4271, "positive": "left", "upright": 1000}},
         ),
+        (lambda each: {**each, "a": each["a"] % 4}, {"angle": {"wraps": 4}}),
         (lambda each: {**each, "u": -each["u"] / 255}, {"motor": {"full": 1, "positive": "left"}}),
         (lambda each: {**each, "u": np.roll(each["u"], 1)}, {"motor": {"row": "in_force"}}),
     ],
@@ -537,6 +538,14 @@ BROKEN: dict[str, tuple[Callable[[Columns], Columns], list[str]]] = {
         lambda each: {**each, "x": (each["x"] + 0.01) % 0.3},
         ["the cart would be faster than 5 m/s"],
     ),
+    "pole's counter of 16 bits": (
+        lambda each: {**each, "a": each["a"] % 4},
+        [r"^the angle leaps in \d+ of 1500 rows, first in row \d+ of log.csv: .* as layout.angle.wraps"],
+    ),
+    "one leap": (
+        lambda each: {**each, "a": each["a"] + 10 * (np.arange(STEPS) > 700)},
+        ["^the angle leaps in 1 of 1500 rows, first in row 702 of log.csv: "],
+    ),
     "states of every other row": (
         lambda each: {
             name: values if name in "tu" else np.repeat(values[::2], 2) for name, values in each.items()
@@ -559,7 +568,7 @@ def test_each_fault_of_a_log_is_a_doubt(
     doubts = re.findall("doubt: (.*)", capsys.readouterr().out)
     for doubt in expected:
         assert any(re.search(doubt, each) for each in doubts), doubts
-    alone = "time", "half a turn", "position.positive", "more often"
+    alone = "time", "half a turn", "position.positive", "more often", "leaps"
     if any(each in expected[0] for each in alone):  # nothing else is wrong
         assert len(doubts) == len(expected)
 
