@@ -116,7 +116,11 @@ def log_files(config: ImportConfig) -> list[Path]:
         return [source]
     if not source.is_dir():
         raise ConfigError(f"from={source}: there is no such file or folder")
-    found = sorted(path for path in source.iterdir() if path.suffix.lower() in SUFFIXES)
-    if not found:
+    if not (found := logs_in(source)):
         raise ConfigError(f"from={source}: the folder holds no {', '.join(SUFFIXES)} file")
     return found
+
+
+def logs_in(folder: Path) -> list[Path]:
+    """Return the files of a folder that may be logs."""
+    return sorted(path for path in folder.glob("*") if path.suffix.lower() in SUFFIXES)

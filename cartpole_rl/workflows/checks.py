@@ -16,7 +16,7 @@ from cartpole_rl.checking import missing
 from cartpole_rl.choices import group_choices
 from cartpole_rl.envs.settings import shipped_carts
 from cartpole_rl.errors import CheckpointError, ConfigError
-from cartpole_rl.identification.settings import ImportConfig, log_files
+from cartpole_rl.identification.settings import ImportConfig, log_files, logs_in
 from cartpole_rl.plants.settings import emulated_pole
 from cartpole_rl.randomization.poles import Pole, check_one_pole
 from cartpole_rl.randomization.ranges import check_carts
@@ -177,13 +177,15 @@ def check_installed(setting: str, extra: str, where: str = "") -> None:
 def exported_recordings(source: Path) -> tuple[str | None, list[Path]]:
     """Return the format of what `source` holds of cartpole-export, None for logs, and its places.
 
-    `source` is a file, a folder of files, the folder of a data set of Minari or its name there.
+    `source` is a file, a folder of files without logs, the folder of a data set of Minari or its name there.
     """
     own = Path(os.environ.get("MINARI_DATASETS_PATH") or Path.home() / ".minari/datasets") / source
     for data in (source, source / "data", *source.glob("cartpole_rl/*/data"), own / "data"):
         if (data / MINARI_FILE).is_file():
             return "minari", [data]
     files = [source] if source.suffix == ".mcap" and source.is_file() else sorted(source.glob("*.mcap"))
+    if logs_in(source):  # a bag of ROS 2 may stand beside them
+        files = []
     return ("mcap" if files else None), files
 
 

@@ -78,6 +78,9 @@ def import_logs(config: ImportConfig, folder: Path) -> Sensors | None:
         raise others[0]
     for other in others:
         print_message("import", f"note: left out: {other}")
+    for path in sorted(config.source.glob("*.mcap")):
+        said = f"{path} is no log; give a recording of cartpole-export alone"
+        print_message("import", f"note: left out: {said}")
     long = {path: read for path, read in rows.items() if read.time[-1] >= config.layout.shortest} or rows
     period = config.layout.period or common_period(long, config.source)
     logs = {

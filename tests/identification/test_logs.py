@@ -651,6 +651,8 @@ def test_a_file_beside_the_logs_is_left_out(
     short = {name: values[:2] for name, values in motion.items()}
     written(folder / "short.csv", {**short, "t": np.array([0, 0.5])})  # of no period
     written(folder / "a.csv", motion)
+    (folder / "bag_0.mcap").write_bytes(b"of ROS 2")
+    reasons["bag_0.mcap"] = " is no log; give a recording of cartpole-export alone"
     import_logs(imported(folder), tmp_path / "run")
     said = capsys.readouterr()
     for name, reason in reasons.items():
