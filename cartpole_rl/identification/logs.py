@@ -346,6 +346,11 @@ def times(path: Path, values: Array, column: TimeColumn) -> Array:
     time = (values - values[0]) * SECONDS[column.unit]
     if (back := np.flatnonzero(np.diff(time) <= 0)).size:
         before, after = time[back[0] : back[0] + 2]
+        if before == after:
+            raise RecordingError(
+                f"{path}: the time {column.name} is {values[back[0]]:.9g} in rows {back[0] + 1} and "
+                f"{back[0] + 2}; write it with more digits, or leave one of the rows out"
+            )
         raise RecordingError(
             f"{path}: the time {column.name} goes from {before:.6g} to {after:.6g} s after row "
             f"{back[0] + 1}; sort the rows, give another column, or cut the log where the clock began anew"

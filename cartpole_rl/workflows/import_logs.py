@@ -91,9 +91,8 @@ def import_logs(config: ImportConfig, folder: Path) -> Sensors | None:
     if not parts:
         raise RecordingError(nothing_left(reports, period, config))
     with progress_bar(None, "steps", desc="sensors") as bar:
-        sensors = question_sensors(
-            motions(parts if period <= LONGEST_PERIOD else []), period, on_step=bar.update
-        )
+        taken = parts if SHORTEST_PERIOD <= period <= LONGEST_PERIOD else []  # at 1 kHz it takes minutes
+        sensors = question_sensors(motions(taken), period, on_step=bar.update)
     if angle_leaps(reports, period):  # then it tells nothing, and nor does what is estimated with it
         sensors = Sensors(None, None, None, None, None, sensors.push, 0.0)
     found = [*doubts(reports, sensors, period, config.layout)]

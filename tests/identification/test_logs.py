@@ -428,6 +428,10 @@ def test_the_period_is_the_mean_gap(tmp_path: Path, motion: Columns) -> None:
             "line 2: it has 8 cells under 4 names; mend decimal=",
         ),
         ('t,x,a,u\n0,0,0,"0\n1,0,two,0\n', "line 3: a is 'two'"),
+        (
+            "t,x,a,u\n0,0,0,0\n0.1,0,0,0\n0.1,1,0,0\n",
+            r"the time t is 0\.1 in rows 2 and 3; write it with more digits, or leave one of the rows out",
+        ),
         ("t,x,a,u\n0,0,0,0\n9,0,0,0\n1,0,0,0\n", "the time t goes from 9 to 1 s after row 2; sort the rows"),
     ],
 )
@@ -601,6 +605,20 @@ def test_a_balanced_pole_tells_half_a_turn_from_a_wrong_side(
     import_logs(imported(path), tmp_path / "run")
     doubts = re.findall("doubt: (.*)", capsys.readouterr().out)
     assert [re.search(expected, each) is not None for each in doubts] == [True] * bool(expected), doubts
+
+
+@pytest.mark.parametrize(("period", "known"), [(0.02, True), (0.001, False), (1.0, False)])
+def test_no_sensor_is_estimated_with_a_period_that_is_refused(
+    tmp_path: Path, motion: Columns, period: float, known: bool
+) -> None:
+    """With one of 1 ms it would take minutes."""
+    columns = {**motion, "t": period * np.arange(STEPS)}
+    sensors = import_logs(
+        imported(written(tmp_path / "log.csv", columns)).model_copy(update={"layout": layout(shortest=1)}),
+        tmp_path / "run",
+    )
+    assert sensors is not None
+    assert (sensors.delay is not None) == known
 
 
 def test_logs_of_several_periods_are_refused(tmp_path: Path, motion: Columns) -> None:
