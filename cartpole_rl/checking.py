@@ -13,7 +13,9 @@ from cartpole_rl.settings import Settings
 
 # the tags of unions, which pydantic adds to a key
 TAGS = re.compile(
-    r"(?<=^plant\.)(simulated|emulated|serial|text|driver|learned)\.|(?<=^learner\.)(local|ray)\.|(?<=^randomization\.)(ranges|identified)\."
+    r"(?<=^plant\.)(simulated|emulated|serial|text|driver|learned)\.|(?<=^learner\.)(local|ray)\."
+    r"|(?<=^randomization\.)(ranges|identified)\."
+    r"|\.literal\[[^]]*\]$|\.constrained-float$|(?<=\.wraps)\.bool$"
 )
 NEAR = 0.8  # similarity of two names, 0 to 1, from which one is suggested for the other
 NEAR_VALUE = 0.6  # similarity from which a value is suggested
@@ -65,10 +67,14 @@ def validated(
     try:
         return schema(**values)
     except ValidationError as error:
-        complaints = (
-            f"{source(_key(detail))}{_complaint(detail, schema, values)}" for detail in error.errors()
-        )
-        raise ConfigError("; ".join(complaints)) from None
+        complaints: dict[str, str] = {}
+        for detail in error.errors():
+            key = _key(detail)
+            if key in complaints:  # another member of a union
+                complaints[key] += f", or {_reason(detail).removeprefix('give ')}"
+            else:
+                complaints[key] = f"{source(key)}{_complaint(detail, schema, values)}"
+        raise ConfigError("; ".join(complaints.values())) from None
 
 
 def _key(detail: Mapping[str, Any]) -> str:
@@ -102,6 +108,8 @@ def _reason(detail: Mapping[str, Any]) -> str:
         return f"{_meant(detail)}{remedy.format(**limits)}{unit}"
     if detail["type"] == "tuple_type":
         given = detail["input"]
+        if "keep" in detail["loc"]:
+            return "give the lowest and the highest value, as [0,0.5]"
         return f"give a list, as [{given if isinstance(given, int | float | str) else '0.5,0.02'}]"
     reason: str = detail["msg"].removeprefix("Value error, ")
     return reason[0].lower() + reason[1:] if detail["loc"] else reason

@@ -204,7 +204,7 @@ def read_columns(path: Path, layout: Layout) -> dict[str, Array]:
     except (OSError, UnicodeDecodeError) as error:
         if isinstance(error, OSError):
             raise RecordingError(f"{path} cannot be read: {error.strerror}") from None
-        raise NotALogError(f"{path} cannot be read: it is not UTF-8 text") from None
+        raise NotALogError(f"{path} cannot be read: it is not UTF-8 text; save it as UTF-8") from None
     (number, names), numbered = heading_and_rows(text, layout, wanted)
     if not numbered:
         raise NotALogError(f"{path} holds no rows; give a log with a line of column names")
@@ -334,10 +334,13 @@ def _numbers(
         try:
             values[index] = float(cell.replace(layout.decimal, ".") or "nan")
         except ValueError:
-            raise RecordingError(
-                f"{path}, line {line}: {name} is {cell!r}; give a number, or mend decimal= and delimiter= of "
-                "the layout"
-            ) from None
+            if NUMBERS.fullmatch(cell) and ":" not in cell:
+                advice = ", or mend decimal= and delimiter= of the layout"
+            elif NUMBERS.fullmatch(cell):
+                advice = f" in {layout.time.unit}" if name == layout.time.name else ""
+            else:
+                advice = f", leave the cell empty, or begin the line with {layout.comment}"
+            raise RecordingError(f"{path}, line {line}: {name} is {cell!r}; give a number{advice}") from None
     return values
 
 

@@ -1,9 +1,9 @@
 """Settings of identification: learning a residual, and layouts of logs with their import."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.rig.hardware import RigSettings
@@ -79,6 +79,12 @@ class Layout(Settings):
     # column: lowest and highest value of a row that counts
     keep: dict[Name, tuple[Finite, Finite]] = Field(default_factory=dict)
     shortest: Positive = 1.5  # s of a part that is kept
+
+    @field_validator("delimiter", mode="before")
+    @classmethod
+    def _tab_is_typed(cls, given: Any) -> Any:
+        """Take a backslash and a t, as in a shell or in YAML's single quotes, for a tab."""
+        return "\t" if given == r"\t" else given
 
     @model_validator(mode="after")
     def _columns_differ(self) -> "Layout":

@@ -138,6 +138,7 @@ def imported(source: Path) -> ImportConfig:
         ({"delimiter": ";", "decimal": ","}, {"decimal": ","}),
         ({"delimiter": "\t", "head": "\ufeff# made by hand\n# second line\n"}, {}),
         ({"delimiter": " "}, {}),
+        ({"delimiter": "\t"}, {"delimiter": r"\t"}),  # as a shell gives it
         ({"head": "% written by MATLAB\n\n"}, {"comment": "%"}),
         ({"delimiter": " ", "row": "{:16.9g}"}, {}),
         ({"delimiter": " ", "head": "# of Monday\n# "}, {}),  # numpy.savetxt(header=...)
@@ -429,6 +430,12 @@ def test_the_period_is_the_mean_gap(tmp_path: Path, motion: Columns) -> None:
         ),
         ('t,x,a,u\n0,0,0,"0\n1,0,two,0\n', "line 3: a is 'two'"),
         (
+            "t,x,a,u\ns,m,rad,V\n0,0,0,0\n1,0,0,0\n",
+            "line 2: t is 's'; give a number, leave the cell empty, or begin the line with #$",
+        ),
+        ("t,x,a,u\n12:00:00.5,0,0,0\n", r"line 2: t is '12:00:00\.5'; give a number in s$"),
+        ("t;x;a;u\n0;0,5;0;0\n", "line 2: x is '0,5'; give a number, or mend decimal= and delimiter="),
+        (
             "t,x,a,u\n0,0,0,0\n0.1,0,0,0\n0.1,1,0,0\n",
             r"the time t is 0\.1 in rows 2 and 3; write it with more digits, or leave one of the rows out",
         ),
@@ -446,7 +453,12 @@ def test_a_bad_log_is_one_line(tmp_path: Path, text: str, message: str) -> None:
     ("changes", "message"),
     [
         ({"keep": {"bad": [1, 0]}}, r"give the lower bound first, as \[0,1\]"),
-        ({"angle": {"unit": "grad"}}, "angle.unit"),
+        (
+            {"angle": {"unit": "degrees"}},
+            r"^angle\.unit=degrees: did you mean deg\? give 'rad', .*, or a number$",
+        ),
+        ({"angle": {"wraps": "maybe"}}, r"^angle\.wraps=maybe: give true or false, or a number$"),
+        ({"keep": {"bad": 0}}, r"^keep\.bad=0: give the lowest and the highest value, as \[0,0\.5\]$"),
         ({"motor": {"full": 0}}, "motor.full=0"),
         ({"angle": {"name": "x"}}, "angle.name=x: position.name is the same; give each its own column"),
     ],
@@ -657,7 +669,7 @@ def test_a_file_beside_the_logs_is_left_out(
     written(folder / "aborted.csv", {name: values[:1] for name, values in motion.items()})
     reasons = {
         "notes.txt": " has no column t, x, a, u; it has on, Monday",
-        "measures.txt": " cannot be read: it is not UTF-8 text",
+        "measures.txt": " cannot be read: it is not UTF-8 text; save it as UTF-8",
         "aborted.npz": " has fewer than two rows with a number in each of t, x, a, u",
         "aborted.csv": " has fewer than two rows with a number in each of t, x, a, u",
     }
