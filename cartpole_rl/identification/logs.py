@@ -53,6 +53,7 @@ class Report(NamedTuple):
     beyond: int  # rows with a motor value beyond full
     leaps: int  # rows to which no pole turns from the row before
     leap: str  # the first of them
+    anew: bool  # they are of one size, as where a counter begins anew
     jumps: int  # rows to which the cart would be faster than FASTEST
     stale: float  # share of the rows of a turning pole that have the states of the row before
     period: float  # s
@@ -173,6 +174,7 @@ def cut_log(read: Rows, layout: Layout, encoders: Encoders, period: float) -> Lo
         int((np.abs(motor) > 1.001).sum()),
         len(leaps),
         f"row {leaps[0] + 1} of {path.name}" if len(leaps) else "",
+        len(leaps) > 0 and float(np.ptp(turned[leaps - 1])) < SMALL_LEAP,
         int((np.abs(np.diff(x)) > FASTEST * gaps).sum()),
         stale_share(x, theta),
         period,

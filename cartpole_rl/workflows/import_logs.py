@@ -206,9 +206,13 @@ def doubts(reports: Sequence[Report], sensors: Sensors, period: float, layout: L
 
 
 def angle_leaps(reports: Sequence[Report], period: float) -> int:
-    """Return in how many rows the angle leaps; 0 for a few of a long period."""
-    leaps = sum(each.leaps for each in reports)
-    return leaps if period <= QUICK or leaps > LEAPS * sum(each.rows for each in reports) else 0
+    """Return in how many rows the angle leaps; 0 for a few of a long period, or of sizes that differ.
+
+    A potentiometer gives any value in its dead zone.
+    """
+    leaps, anew = sum(each.leaps for each in reports), any(each.anew for each in reports)
+    many = leaps > LEAPS * sum(each.rows for each in reports)
+    return leaps if many or (anew and period <= QUICK) else 0
 
 
 def _time_doubts(reports: Sequence[Report], period: float, layout: Layout) -> Iterator[str]:

@@ -720,6 +720,15 @@ def test_the_layout_of_the_guide_is_taken(tmp_path: Path) -> None:
     assert (taken.time.name, taken.motor.row, taken.keep) == ("t_ms", "in_force", {"error": (0, 0)})
 
 
+def test_a_few_values_of_a_potentiometers_dead_zone_are_no_doubt(
+    tmp_path: Path, motion: Columns, capsys: pytest.CaptureFixture[str]
+) -> None:
+    angle = motion["a"].copy()
+    angle[[300, 900]] += 2.0, 2.8
+    import_logs(imported(written(tmp_path / "log.csv", {**motion, "a": angle})), tmp_path / "run")
+    assert "leaps" not in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("late", [0, 10])
 def test_a_good_log_has_no_doubt_and_becomes_recordings(
     tmp_path: Path, late: int, capsys: pytest.CaptureFixture[str]
