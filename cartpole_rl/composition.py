@@ -54,7 +54,7 @@ from cartpole_rl.choices import (
     read_file,
 )
 from cartpole_rl.errors import ConfigError, reason_of
-from cartpole_rl.rig.hardware import HARDWARE, hardware_of
+from cartpole_rl.rig.hardware import HARDWARE, check_track
 from cartpole_rl.rig.parameters import PARAMETERS, check_value, completed
 from cartpole_rl.run_folder import (
     CONFIG,
@@ -520,7 +520,7 @@ def _check_cart(word: str, cart: Chosen) -> None:
     try:
         for name in numbers.keys() & PARAMETERS.keys():
             check_value(name, numbers[name])
-        hardware_of({**cart.values, **numbers})
+        check_track({**cart.values, **numbers})
     except ConfigError as error:
         raise ConfigError(f"{word}: {str(error).removeprefix('cart.').removeprefix('cart: ')}") from None
     if missing := [name for name in known if name not in completed(cart.values)]:

@@ -29,12 +29,11 @@ import numpy as np
 from cartpole_rl.envs.guard import guard_side
 from cartpole_rl.envs.settings import LARGEST_MARGIN, TrackGuard
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.plants.measured import BlindMotion, measured_part
+from cartpole_rl.plants.measured import FROZEN, BlindMotion, measured_part, shortened
 from cartpole_rl.plants.specs import Numbers, Plant, PlantOutput
 from cartpole_rl.rig.hardware import LARGEST_MOTOR, Encoders, Hardware, nominal_hardware
 from cartpole_rl.scheduling import no_garbage_collection
 from cartpole_rl.tasks.episode import Ending, Episode
-from cartpole_rl.wire.messages import Fault
 
 CLEARANCE = 0.0926  # m to the soft limit: what carts overrun that are harder to brake than assumed, and more
 LARGEST_CLEARANCE = 0.25  # of the way from the middle to the soft limit, on a short track
@@ -51,7 +50,7 @@ LONGEST_MOVE = 4.0  # s
 STANDING, LONGEST_STOP = 0.005, 3.0  # m/s, s: at the end of an experiment
 
 BROKEN_AWAY = 0.002  # m
-SURELY = 1.2, 2.2  # times the breakaway motor value, measured or by the file: it moves the cart
+SURELY = 1.2  # times the measured breakaway motor value: it moves the cart
 GIVEN_UP = 0.5  # s after which a cart that does not move is held by friction
 RIGHT, LEFT = 1, -1
 
@@ -81,11 +80,11 @@ class Task(NamedTuple):
     def of(cls, period: float, random: np.random.Generator, hardware: Hardware) -> "Task":
         """Return the conditions before the cart is known."""
         breakaway = min(LARGEST_MOTOR, round(BREAKAWAY * hardware.breakaway_motor))
-        return cls(period, random, breakaway, SURELY[1] * hardware.breakaway_motor, hardware)
+        return cls(period, random, breakaway, hardware.hard_push, hardware)
 
     def knowing(self, breakaway: int) -> "Task":
         """Return the conditions once the breakaway motor value is measured."""
-        return self._replace(breakaway=breakaway, surely=SURELY[0] * breakaway)
+        return self._replace(breakaway=breakaway, surely=SURELY * breakaway)
 
     @property
     def side(self) -> float:
@@ -343,7 +342,7 @@ def run(
     the moves or the guard requested last.
     """
     counts, gaps, motors, ended = [present.counts], [*present.dt], [], str(Ending.TIME)
-    blind, fault = BlindMotion(task.hardware, task.surely), Fault.NONE
+    blind, stands = BlindMotion(task.hardware, task.surely), 0
     requested, breakaway = next(moves), None
     guard, encoders = experiment_guard(task.period, task.hardware), plant.hardware.encoders
     end = track_end(task.hardware, float(plant.track_half_length))
@@ -358,7 +357,7 @@ def run(
             ended = str(plant.ended_by or Ending.TRACK)
             break
         if blind.is_seen(motors[-1], counts[-1][0], gaps[-1]):
-            ended, fault = str(Ending.FAULT), Fault.CART_ENCODER
+            ended, stands = str(Ending.FAULT), blind.periods
             plant.halt()
             break
         try:
@@ -368,7 +367,10 @@ def run(
             present = plant.step_one(0) if motor or motors[-1] else present
             break
     recorded = recording(np.array(counts), np.array(gaps[1:]), np.array(motors), ended, encoders)
-    measured = measured_part(recorded, plant.fault | fault, plant.hardware)
+    if stands:
+        measured = shortened(recorded, len(motors) - stands, FROZEN)
+    else:
+        measured = measured_part(recorded, plant.fault, plant.hardware)
     if measured.left_out:
         plant.distrust()
     return measured, present, breakaway

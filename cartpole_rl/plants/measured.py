@@ -29,6 +29,7 @@ LEANING = 0.025 + 0.008  # rad: largest error of the encoder's zero, and what fr
 FALLEN = np.radians(10)  # rad: near enough to upright
 BLIND, LATE = 0.015, 3  # m that a cart has moved by its file while its count stood, for more periods
 HALF = 0.5  # s, over which a pole of up to 1.4 m multiplies its angle by 2.7 or more
+FROZEN = "the cart's count froze"
 LATCHED = Fault.CART_ENCODER | Fault.STALL, Fault.POLE_ENCODER  # a dead cart encoder can show as a STALL
 
 
@@ -59,10 +60,10 @@ def measured_part(episode: Episode, fault: Fault = Fault.NONE, hardware: Hardwar
             frozen = pole_froze(speed[max(0, last - 1) :])
         frozen |= stopped_dead(own, gaps, last, sudden)
         if (frozen or (fault & faults and not jumps.any())) and last < steps:
-            steps, why = last, f"the {name}'s count froze"
+            steps, why = last, FROZEN if name == "cart" else "the pole's count froze"
     if steps == end and fault & (Fault.CART_ENCODER | Fault.POLE_ENCODER):
         steps, why = max(0, end - 1), "a count jumped"  # lost states may hide the jump
-    return episode if steps == end else _shortened(episode, steps, why)
+    return episode if steps == end else shortened(episode, steps, why)
 
 
 class BlindMotion:
@@ -77,7 +78,7 @@ class BlindMotion:
         self._acceleration = 1 / (hardware.motor_per_newton * hardware.moving_mass)  # m/s^2 a motor value
         self._count: int | None = None
         self._speed = self._way = 0.0  # m/s, m: estimated since the count stands
-        self._periods = 0  # for which it stands
+        self.periods = 0  # for which it stands
 
     def is_seen(self, motor: int, count: int, passed: float) -> bool:
         """Return True if the cart must have moved under its last motor values, which lasted `passed` s each.
@@ -85,14 +86,14 @@ class BlindMotion:
         `count` is that of the cart after them. To and fro by one is no change of it.
         """
         if self._count is None or abs(count - self._count) > 1:
-            self._count, self._speed, self._way, self._periods = count, 0.0, 0.0, 0
+            self._count, self._speed, self._way, self.periods = count, 0.0, 0.0, 0
         push = max(0.0, abs(motor) - self._breakaway)
         self._speed += math.copysign(push, motor) * self._acceleration * passed
         if not push:
             self._speed = 0.0
         self._way += self._speed * passed
-        self._periods += 1
-        return abs(self._way) > BLIND and self._periods > LATE  # what was sent last may not have acted yet
+        self.periods += 1
+        return abs(self._way) > BLIND and self.periods > LATE  # what was sent last may not have acted yet
 
 
 def last_change(count: NDArray[np.int64], open_wire: bool) -> int:
@@ -153,7 +154,8 @@ def pole_froze(speed: Array) -> bool:
     return bool(min(rise, fall) >= SPEED_CHANGE)
 
 
-def _shortened(episode: Episode, steps: int, why: str) -> Episode:
+def shortened(episode: Episode, steps: int, why: str) -> Episode:
+    """Return the first `steps` of an episode, which then ends by a fault; log `why`."""
     left_out = f"{why}: the last {episode.steps - steps} of {episode.steps} control periods do not count"
     LOGGER.warning("%s", left_out)
     return replace(episode.part(0, steps), ended_by=str(Ending.FAULT), left_out=left_out)

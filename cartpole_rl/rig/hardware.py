@@ -133,14 +133,18 @@ def parameters_of(cart: Mapping[str, float]) -> dict[str, float]:
 def hardware_of(cart: Mapping[str, float]) -> Hardware:
     """Return the hardware in a cart's file, ip02's where it gives none. Raises ConfigError."""
     given = {name: cart[name] for name in HARDWARE if name in cart}
-    hardware = nominal_hardware() if not given else _hardware(tuple(given.items()))
+    return nominal_hardware() if not given else _hardware(tuple(given.items()))
+
+
+def check_track(cart: Mapping[str, float]) -> None:
+    """Raise ConfigError if the track of a cart's file reaches beyond its stops."""
+    hardware = hardware_of(cart)
     end, stop = cart.get("track_half_length", 0.0), hardware.half_span
     if end > stop:
         raise ConfigError(
             f"cart.track_half_length is {end:g} m, but the stops are {stop:g} m from the middle by "
             f"track_span; give at most {stop - hardware.soft_limit:g} m, up to the soft limit"
         )
-    return hardware
 
 
 @cache

@@ -95,7 +95,7 @@ def evaluated_agent(config: EvaluateConfig) -> TrainedAgent:
         driven = {
             "control_period": training.control_period,
             "observation": training.observation.model_dump(mode="json"),
-            "hardware": training.hardware.model_dump(include={*SAME_RIG}),
+            "hardware": hardware_of(config.cart or training.cart).model_dump(include={*SAME_RIG}),
         }
         return TrainedAgent(training, OwnPolicy(config.run, training.actions.motors, driven))
     if config.run != BASELINE:
@@ -106,7 +106,10 @@ def evaluated_agent(config: EvaluateConfig) -> TrainedAgent:
 def own_training(config: EvaluateConfig, names: Sequence[str], choices: Mapping[str, Any]) -> TrainConfig:
     """Return the settings of conf/train.yaml with `choices`, and with what `config` gives under `names`."""
     given = {name: value for name in names if (value := getattr(config, name)) is not None}
-    return load_settings(TrainConfig, choices).model_copy(update=given)
+    training = load_settings(TrainConfig, choices)
+    if track := given.get("cart", {}).get("track_half_length"):
+        given["task"] = training.task.model_copy(update={"x_max": track})
+    return training.model_copy(update=given)
 
 
 def baseline_agent(config: EvaluateConfig, training: TrainConfig) -> TrainedAgent:
@@ -250,9 +253,10 @@ def replaced_settings(training: TrainConfig, config: EvaluateConfig) -> CartPole
     own = {name: getattr(training, name) for name in CartPoleSettings.model_fields}
     given = {name: value for name in REPLACEABLE if (value := getattr(config, name)) is not None}
     if config.task is not None or config.cart is not None:
-        task, track = config.task or training.task, config.cart or {"track_half_length": training.task.x_max}
-        x_max = (config.task and config.task.x_max) or track["track_half_length"]
-        given["task"] = {**task.model_dump(), "x_max": x_max}
+        task, x_max = config.task or training.task, training.task.x_max
+        if x_max == training.nominal_cart["track_half_length"]:  # not one that was chosen for the training
+            x_max = (config.cart or {}).get("track_half_length", x_max)
+        given["task"] = {**task.model_dump(), "x_max": (config.task and config.task.x_max) or x_max}
     if config.pole is None and (own_pole := config.plant.own_pole(config.emulator, training.pole)):
         given["pole"] = own_pole
     if config.actions is not None:

@@ -20,7 +20,7 @@ from cartpole_rl.identification.settings import ImportConfig, log_files, logs_in
 from cartpole_rl.plants.settings import emulated_pole
 from cartpole_rl.randomization.poles import Pole, check_one_pole
 from cartpole_rl.randomization.ranges import check_carts
-from cartpole_rl.rig.hardware import hardware_of, parameters_of
+from cartpole_rl.rig.hardware import check_track, hardware_of, parameters_of
 from cartpole_rl.rig.parameters import check_names, check_value, check_values, completed
 from cartpole_rl.run_folder import (
     BASELINE,
@@ -82,6 +82,7 @@ def check_training(config: TrainConfig, folder: Path, words: Sequence[str]) -> N
     config.check_learning()
     if config.compile:
         check_compiler()
+    check_track(config.cart)
     check_carts(config.nominal_cart, config.pole, config.ranges)
     config.plant.check()
     return None
@@ -89,6 +90,7 @@ def check_training(config: TrainConfig, folder: Path, words: Sequence[str]) -> N
 
 def check_evaluation(config: EvaluateConfig, words: Sequence[str]) -> None:
     """Raise CartPoleError if the agent, the cart or the episode to repeat does not exist."""
+    check_track(config.cart or {})
     check_repetition(config, words)
     if config.run != BASELINE and not is_own_policy(config.run):
         check_agent(config.run)

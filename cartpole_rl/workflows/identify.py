@@ -178,6 +178,11 @@ def as_recorded(config: IdentifyConfig, words: Sequence[str]) -> IdentifyConfig:
         for name in OF_CART
         if name in recorded and recorded[name] != given[name] and not is_given([name], words)
     }
+    numbers = [word.lstrip("+").partition("=")[0] for word in words if word.lstrip("+").startswith("cart.")]
+    if numbers and not any(word.startswith("cart=") for word in words):  # they change the recorded cart
+        names = {key.removeprefix("cart.") for key in numbers} & given["cart"].keys()
+        changed = {name: given["cart"][name] for name in names}
+        taken = {"cart": {**recorded.get("cart", given["cart"]), **changed}, **taken}
     if taken:
         print_message("identify", f"note: {' and '.join(taken)} as in from={config.source}")
     return recorded_settings(IdentifyConfig, {**given, **taken}, f"from={config.source}")
@@ -242,7 +247,8 @@ def split(recordings: Episodes) -> tuple[Episodes, Episodes]:
     If they are too short to judge a fit, they are chosen among the long ones. Of a single one, or a single
     long one, the last fifth is held out.
     """
-    held_out = [HELD_OUT] if HELD_OUT in recordings else some_of([*recordings])
+    named = HELD_OUT in recordings and len(recordings) > 1
+    held_out = [HELD_OUT] if named else some_of([*recordings])
     seconds = {name: float(np.ptp(episode.time)) for name, episode in recordings.items()}
     if HELD_OUT not in held_out and sum(seconds[name] for name in held_out) < SHORTEST_HELD_OUT:
         held_out = some_of([name for name in recordings if seconds[name] >= SHORTEST_HELD_OUT])

@@ -283,8 +283,17 @@ def test_a_mistake_is_one_line_and_a_list_a_table(source: Path, tmp_path: Path, 
         ("--size huge", 2, "--size huge: give quick"),
         (f"--list --studies {tmp_path}", 2, f"{tmp_path}: it holds no study"),
         (f"toy --studies {source}/toy.yaml", 2, f"{source}/toy.yaml: there is no such folder of studies"),
-        (f"lqr --folder {tmp_path}/file", 1, f"{tmp_path}/file/quick: Not a directory"),
-        (f"lqr --folder {tmp_path}", 1, f"lqr/lqr/10 failed: {tmp_path}/quick/lqr/lqr/10: Not a directory"),
+        (
+            f"lqr --folder {tmp_path}/file",
+            2,
+            f"{tmp_path}/file/quick: this path, or a part of it, is a file; give another folder",
+        ),
+        (
+            f"lqr --folder {tmp_path}",
+            1,
+            f"lqr/lqr/10 failed: {tmp_path}/quick/lqr/lqr/10: this path, or a part of it, is a file; "
+            "give another folder",
+        ),
     ):
         said = called(*words.split())
         assert (said.code, said.complaint) == (code, f"scripts/reproduce: {complaint}")

@@ -15,7 +15,7 @@ from cartpole_rl.choices import choice, default_choices, group_choices
 from cartpole_rl.composition import compose
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.rig.hardware import parameters_of
-from cartpole_rl.workflows.build import own_training, replaced_settings
+from cartpole_rl.workflows.build import evaluated_agent, own_training, replaced_settings
 from cartpole_rl.workflows.checks import check_training, note_other_numbers
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig, load_settings
 
@@ -220,6 +220,26 @@ def test_an_evaluation_with_a_cart_ends_at_its_track(task: dict[str, str]) -> No
     config = load_settings(EvaluateConfig, {"run": "lqr", "cart": "sensorsini", "pole": "sensorsini", **task})
     training = own_training(config, ("cart",), {})
     assert replaced_settings(training, config).task.x_max == choice("cart/sensorsini")["track_half_length"]
+
+
+def test_a_track_that_was_chosen_for_a_training_stays() -> None:
+    training = load_settings(TrainConfig, {"task.x_max": 0.25})
+    evaluation = load_settings(EvaluateConfig, {"run": "somewhere", "cart": "ip02"})
+    assert replaced_settings(training, evaluation).task.x_max == 0.25
+    longer = load_settings(TrainConfig, {"cart.track_half_length": 0.5})  # of a run from before the check
+    assert replaced_settings(longer, evaluation.model_copy(update={"cart": None})).task.x_max == 0.5
+
+
+def test_an_exported_agent_is_checked_against_the_cart_that_it_drives(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    driven: list[Any] = []
+    monkeypatch.setattr(
+        "cartpole_rl.workflows.build.OwnPolicy", lambda run, motors, given: driven.append(given)
+    )
+    evaluated_agent(load_settings(EvaluateConfig, {"run": "agent.onnx", "cart": "sensorsini"}))
+    track = choice("cart/sensorsini")["track_span"]
+    assert (driven[0]["hardware"]["track_span"], driven[0]["control_period"]) == (track, 0.02)
 
 
 @pytest.mark.parametrize(
