@@ -77,7 +77,7 @@ def fitted_guard(
     motors: Sequence[int],
     models: Models,
     period: float,
-    track_end: float = LARGEST_MARGIN,
+    track_end: float,
 ) -> TrackGuard:
     """Return the guard that a share `quantile` of the carts of `draws` obeys in time.
 

@@ -16,6 +16,7 @@ from tqdm import tqdm
 
 from cartpole_rl.checking import validated
 from cartpole_rl.choices import choice, is_shipped
+from cartpole_rl.composition import key_of
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.recordings import LENGTH, read_recording, write_recording
@@ -178,9 +179,9 @@ def as_recorded(config: IdentifyConfig, words: Sequence[str]) -> IdentifyConfig:
         for name in OF_CART
         if name in recorded and recorded[name] != given[name] and not is_given([name], words)
     }
-    numbers = [word.lstrip("+").partition("=")[0] for word in words if word.lstrip("+").startswith("cart.")]
-    if numbers and not any(word.startswith("cart=") for word in words):  # they change the recorded cart
-        names = {key.removeprefix("cart.") for key in numbers} & given["cart"].keys()
+    keys = [key_of(word) for word in words]
+    names = {key.removeprefix("cart.") for key in keys if key.startswith("cart.")} & given["cart"].keys()
+    if names and "cart" not in keys:  # they change the recorded cart
         changed = {name: given["cart"][name] for name in names}
         taken = {"cart": {**recorded.get("cart", given["cart"]), **changed}, **taken}
     if taken:
