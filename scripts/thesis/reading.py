@@ -43,7 +43,8 @@ ITSELF = ""  # evaluation of a part that is the run of an arm and a seed itself
 CURVE_POINTS = 60
 # keys of metrics.json and identification.json that are stored with the scores
 BEHAVIOUR = (
-    *("upright_at_end", "time_to_upright_s", "rms_motor_change", "rms_angle_rad", "rms_position_m"),
+    *("upright_at_end", "time_to_upright_s", "rms_angle_rad", "rms_position_m"),
+    *("rms_motor_change", "motor_reversals_per_s"),
     *("parameters.pole_coulomb", "parameters.pole_drag"),
 )
 

@@ -60,8 +60,14 @@ def test_time_to_upright_is_the_start_of_lasting_balance() -> None:
 def test_motor_change_and_margin() -> None:
     metrics = episode_metrics(episode([0, 0, 0, 0], x=[0, -0.3, 0.1, 0], motor=[100, -200, -200]), 0.4)
     assert metrics["rms_motor_change"] == pytest.approx(math.sqrt(300**2 / 2))
+    assert metrics["motor_reversals_per_s"] == pytest.approx(1 / (3 * PERIOD))
     assert metrics["min_track_margin_m"] == pytest.approx(0.1)
     assert episode_metrics(episode([0, 0], x=[0, 0.5]), 0.4)["min_track_margin_m"] == pytest.approx(-0.1)
+
+
+def test_a_motor_that_rests_between_two_directions_changes_its_direction_once() -> None:
+    metrics = episode_metrics(episode([0] * 9, motor=[9, 9, 0, 0, -9, 0, -9, 9]), 0.4)
+    assert metrics["motor_reversals_per_s"] == pytest.approx(2 / (8 * PERIOD))
 
 
 def test_equal_values_have_a_narrow_interval_without_a_warning(recwarn: pytest.WarningsRecorder) -> None:

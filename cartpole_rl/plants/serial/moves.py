@@ -221,7 +221,8 @@ def centre(
         motor = controller.motor(before, state)
         before, state = state, moves.drive(motor)
         if blind.is_seen(motor, state.cart_counts, moves.period):
-            raise NotReadyError("the motor pushes, but the cart's count does not change", NO_MOTION)
+            remedy = f"{NO_MOTION}; if it moves freely, its file gives too little friction: cartpole-identify"
+            raise NotReadyError("the motor pushes, but the cart's count does not change", remedy)
     raise NotReadyError(
         "the cart does not come back to the middle; it is "
         f"{moves.metres(state.cart_counts) * 1e3:+.0f} mm off",
