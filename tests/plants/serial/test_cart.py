@@ -99,7 +99,9 @@ class TestMotor:
     def test_what_is_sent_is_within_the_limit_and_returned(self, asked: int, sent: int) -> None:
         with CartPeer() as peer, SerialCart(quick_settings(peer.port)) as cart:
             assert cart.set_motor(asked) == sent
-            assert cart.get_state().motor_applied == sent
+            while not cart.took_motor(state := cart.get_state()):
+                pass  # a busy computer delays the peer
+            assert state.motor_applied == sent
             assert peer.messages(SetMotor)[-1].motor == sent
 
     def test_the_cart_itself_sets_the_limit(self) -> None:
