@@ -170,7 +170,10 @@ def identify_cart(config: IdentifyConfig, folder: Path, words: Sequence[str] | N
 
 
 def as_recorded(config: IdentifyConfig, words: Sequence[str]) -> IdentifyConfig:
-    """Return `config` with the settings of OF_CART of the run that it reads, but those that `words` give."""
+    """Return `config` with the settings of OF_CART of the run that it reads, but those that `words` give.
+
+    Raises ConfigError for words that change a pole which that run did not have.
+    """
     if config.source is None or program_of(config.source) != "identify":
         return config
     given, recorded = config.model_dump(mode="json", by_alias=True), recorded_config(config.source)
@@ -184,6 +187,12 @@ def as_recorded(config: IdentifyConfig, words: Sequence[str]) -> IdentifyConfig:
     if names and "cart" not in keys:  # they change the recorded cart
         changed = {name: given["cart"][name] for name in names}
         taken = {"cart": {**recorded.get("cart", given["cart"]), **changed}, **taken}
+    of_pole = next((word for word in words if key_of(word).startswith("pole.")), None)
+    own, theirs = (list(each.get("pole", {}).get("choices") or ()) for each in (given, recorded))
+    if of_pole and "pole" not in keys and own != theirs != []:
+        raise ConfigError(
+            f"{of_pole}: from={config.source} has the pole {', '.join(theirs)}; give pole= with it"
+        )
     if taken:
         print_message("identify", f"note: {' and '.join(taken)} as in from={config.source}")
     return recorded_settings(IdentifyConfig, {**given, **taken}, f"from={config.source}")

@@ -218,6 +218,10 @@ def test_an_agent_trains_on_what_was_found(run: Path, tmp_path: Path) -> None:
         ),
         ("identify pole=both", "an identification takes one pole"),
         ("identify from=run control_period=0.01", "a frame every 20 ms, not every 10 ms"),
+        (
+            "identify from=large pole.choices.medium.pole_mass=0.12",
+            "pole.choices.medium.pole_mass=0.12: from=large has the pole large; give pole= with it",
+        ),
     ],
 )
 def test_bad_input_is_refused_in_a_line(words: str, said: str, run: Path, tmp_path: Path) -> None:
@@ -226,6 +230,10 @@ def test_bad_input_is_refused_in_a_line(words: str, said: str, run: Path, tmp_pa
     (tmp_path / "single").mkdir()
     shutil.copy(run / "recordings/01_swing.csv", tmp_path / "single")
     (tmp_path / "run").symlink_to(run)
+    shutil.copytree(run, tmp_path / "large", ignore=shutil.ignore_patterns("figures"))
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    config["pole"]["choices"] = {"large": config["pole"]["choices"]["medium"]}
+    (tmp_path / "large/config.yaml").write_text(yaml.safe_dump(config))
     command, *given = words.split()
     done = in_process(command, *given, folder=tmp_path)
     assert said in done.complaint
