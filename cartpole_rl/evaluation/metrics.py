@@ -21,13 +21,18 @@ def episode_metrics(episode: Episode, track_half_length: float) -> dict[str, Any
     `score` and `score_upright` are the sums of (6.2) and (6.1); `time_to_upright_s` the first time from which
     the pole stays within 5 degrees for 1 s; `upright_fraction` the share of periods within 5 degrees, over
     which the RMS of angle and position are taken; `rms_motor_change` that of the step from one motor value to
-    the next; `motor_reversals_per_s` how often the motor changes its direction; `guarded_fraction` the share of periods in which the track guard replaced the agent's motor
-    value; `upright_at_end` is 1 if the pole is within 5 degrees for the last second of a full-length episode;
-    `min_track_margin_m` the smallest distance from `track_half_length`, negative beyond it. Only an episode
-    that the cart's board drove has `same_as_host_fraction`, the share of the compared periods with the motor
-    value that this computer would have sent, and `not_compared_steps`, the number of the other periods.
+    the next; `motor_reversals_per_s` how often the motor changes its direction; `guarded_fraction` the share
+    of periods in which the track guard replaced the agent's motor value; `upright_at_end` is 1 if the pole is
+    within 5 degrees for the last second of a full-length episode; `min_track_margin_m` the smallest distance
+    from the track's end, negative beyond it: from its own on a simulated cart, else from `track_half_length`.
+    Only an episode that the cart's board drove has `same_as_host_fraction`, the share of the compared periods
+    with the motor value that this computer would have sent, and `not_compared_steps`, the number of the other
+    periods.
     """
     upright = is_upright(episode.theta[1:])
+    end = track_half_length
+    if episode.origin is not None:
+        end = episode.origin.parameters.get("track_half_length", end)
     return {
         "score": float(episode.score.sum()),
         "score_upright": float(episode.score_upright.sum()),
@@ -44,7 +49,7 @@ def episode_metrics(episode: Episode, track_half_length: float) -> dict[str, Any
         "rms_motor_change": _rms(np.diff(episode.motor)),
         "motor_reversals_per_s": _reversals_per_s(episode),
         "guarded_fraction": None if episode.guarded is None else float(episode.guarded.mean()),
-        "min_track_margin_m": float(track_half_length - np.abs(episode.x).max()),
+        "min_track_margin_m": float(end - np.abs(episode.x).max()),
         **_same_as_host(episode),
     }
 

@@ -85,7 +85,7 @@ def check_finite(weights: Mapping[str, Any], consequence: str) -> None:
         if isinstance(weight, torch.Tensor) and not weight.isfinite().all():
             raise CheckpointError(
                 f"{consequence}: its weight {name} is not finite, the training has diverged; "
-                "take an earlier checkpoint, or train again with a smaller optimizer.learning_rate"
+                "take an earlier checkpoint, or train again with a smaller learning rate"
             )
 
 

@@ -57,6 +57,8 @@ class Training(Resumable):
     `evaluate` runs the greedy policy on another plant, on any device; `measure` is the score that judges it.
     """
 
+    rate_setting = "optimizer.learning_rate"  # on the command line
+
     def __init__(
         self,
         settings: LearningSettings,
@@ -91,11 +93,12 @@ class Training(Resumable):
         nothing corrects an agent that begins to leave the pole hanging until all start again.
         """
         self.current = self.env.reset()
+        self.retries.reset()
         if self.staggers:
             carts, periods = self.settings.carts, self.env.hardware.task.periods
-            started = torch.arange(carts, device=self.env.device) * periods // carts
-            self.current["step_count"] = started.unsqueeze(1)
-        self.retries.reset()
+            begun = torch.arange(carts, device=self.env.device) * periods // carts
+            self.current["step_count"] = begun.unsqueeze(1)
+            self.retries.reset(begun)
         self.waiting: TensorDictBase | None = None  # [N, n - 1], the last periods if their returns go on
 
     @property
@@ -209,7 +212,7 @@ class Training(Resumable):
         kept = "" if self.last_score is None else "earlier checkpoints are kept; "  # of evaluations
         return LearningError(
             f"learning diverged after {self.transitions} transitions: {how}; {kept}try a smaller "
-            f"optimizer.learning_rate than {self.optimizer_settings.learning_rate:g}"
+            f"{self.rate_setting} than {self.optimizer_settings.learning_rate:g}"
         )
 
     def run_evaluation(self) -> None:

@@ -27,9 +27,10 @@ class Retries:
         self._ended: list[tuple[float, int]] = []  # score and length of the ended episodes
         self.reset()
 
-    def reset(self) -> None:
-        """Count from new episodes on every cart."""
+    def reset(self, begun: Tensor | int = 0) -> None:
+        """Count from new episodes on every cart, which begin after `begun` [N] periods of their time."""
         self._score = torch.zeros(self.env.batch_size, device=self.env.device)  # of the current episodes
+        self._begun = torch.zeros(self.env.batch_size, dtype=torch.long, device=self.env.device) + begun
 
     def record(self, outcome: TensorDictBase) -> Tensor | None:
         """Add a step to the scores; return the carts to keep, [N] bool, or None if no episode ended."""
@@ -38,12 +39,14 @@ class Retries:
         self._mean_score += (score.mean().item() - self._mean_score) / AVERAGED_PERIODS
         if not done.any():
             return None
-        lengths = outcome["step_count"].squeeze(-1)[done]
+        lengths = (outcome["step_count"].squeeze(-1) - self._begun)[done]
         self._ended += zip(self._score[done].tolist(), lengths.tolist(), strict=True)
         chance = torch.rand(self.env.batch_size, generator=self.random, device=self.env.device)
         whole_score = self._mean_score * self.env.hardware.task.periods
-        retry = (self._score < FAILURE_SHARE * whole_score) & (chance < self.probability)
+        failed = (self._score < FAILURE_SHARE * whole_score) & (self._begun == 0)  # others were cut short
+        retry = failed & (chance < self.probability)
         self._score.masked_fill_(done, 0)
+        self._begun.masked_fill_(done, 0)
         return retry
 
     def describe(self) -> dict[str, float]:
@@ -56,9 +59,16 @@ class Retries:
 
     def snapshot(self) -> dict[str, Any]:
         """Return the state, to be saved at once."""
-        return {"score": self._score, "mean_score": self._mean_score, "finished": self._ended}
+        return {
+            "score": self._score,
+            "begun": self._begun,
+            "mean_score": self._mean_score,
+            "finished": self._ended,
+        }
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Restore the state in `snapshot`."""
         self._score = snapshot["score"].to(self.env.device, copy=True)
+        if "begun" in snapshot:  # missing in earlier versions
+            self._begun = snapshot["begun"].to(self.env.device, copy=True)
         self._mean_score, self._ended = snapshot["mean_score"], list(snapshot["finished"])

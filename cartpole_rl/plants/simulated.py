@@ -22,7 +22,7 @@ from cartpole_rl.physics.models import Models, check_laws
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.settings import SimulatedSettings
 from cartpole_rl.plants.specs import Numbers, Plant, PlantOutput
-from cartpole_rl.randomization.randomizer import Draws, draw_start, within_track
+from cartpole_rl.randomization.randomizer import START_SHARE, Draws, draw_start, within_track
 from cartpole_rl.rig.hardware import Encoders, Hardware
 from cartpole_rl.rig.parameters import PARAMETERS
 from cartpole_rl.scalar import Scalar, plain
@@ -243,6 +243,8 @@ class SimulatedPlant(Plant):
         table, motion, counts = self._next_starts(len(rows))
         if again is not None and again.any():
             table = torch.where(again, self._carts.table[:, rows], table)
+            end = START_SHARE * CartParameters(table).track_half_length
+            motion = torch.cat((motion[:1].clamp(-end, end), motion[1:]))
             counts = self._first_counts(table, motion)
         self._carts.table.index_copy_(1, rows, table)
         self._carts = Carts(

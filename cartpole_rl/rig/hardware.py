@@ -74,6 +74,11 @@ class Hardware(Settings):
                 f"hard_limit {self.hard_limit:g} m and soft_limit {self.soft_limit:g} m are distances from a "
                 f"stop; give hard_limit < soft_limit < {self.track_span / 4:g} m, a quarter of track_span"
             )
+        if self.encoders.cart_counts(self.soft_limit) <= self.encoders.cart_counts(self.hard_limit):
+            raise ValueError(
+                f"hard_limit {self.hard_limit:g} m and soft_limit {self.soft_limit:g} m are the same count; "
+                f"give limits that are {self.encoders.metres:g} m apart"
+            )
         return self
 
     @model_validator(mode="after")

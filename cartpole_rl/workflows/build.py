@@ -339,7 +339,8 @@ def evaluated_env(
         raise ConfigError("task.evaluation_start.angle=any: a cart can start only upright or hanging")
     angle: StartPosition = "upright" if start.angle is Start.UPRIGHT else "hanging"
     emulator = config.emulator.model_copy(update={"seed": config.emulator.seed + config.seed})
-    numbers = {**settings.cart, **settings.pole.heaviest.model_dump()}
+    pole = settings.pole.heaviest_on(settings.cart["cart_mass"])
+    numbers = {**settings.cart, **pole.model_dump()}
     plant = config.plant.build(emulator, settings.control_period, angle, prompt, confirm, numbers)
     try:
         return environment(settings, plant)

@@ -150,6 +150,11 @@ class TrainConfig(RunSettings, CartPoleSettings):
             raise ValueError(
                 f"buffer.size {self.buffer.size} must be at least learning.batch_size {learning.batch_size}"
             )
+        if self.buffer.size < (collected := learning.carts * learning.chunk):
+            raise ValueError(
+                f"buffer.size {self.buffer.size} must be at least {collected}, the transitions that are "
+                "collected at once (learning.carts times learning.chunk)"
+            )
         return self
 
     def check_learning(self) -> None:

@@ -62,8 +62,7 @@ def distill(config: DistillConfig, folder: Path) -> float:
             progress.update()
     episodes = judge(nominal_env(training), student.greedy_policy(), config.seed)
     score = mean([episode.total(training.task.measure) for episode in episodes])
-    tuned_poles = [poles.model_dump(mode="json") for poles in teacher.known_poles[1:]]
-    agent = AgentCheckpoint(settings, student.state_dict(), distillation.transitions, score, tuned_poles)
+    agent = AgentCheckpoint(settings, student.state_dict(), distillation.transitions, score)
     save_agent(folder / CHECKPOINTS / LAST, agent)
     report_episodes(folder, episodes, training.plant.kind, training.pole, training.task)
     print(f"a network of {list(config.hidden)} hidden units scores {score:z.0f}")

@@ -84,7 +84,7 @@ def write_rig(config: ExportConfig, folder: Path, words: Sequence[str]) -> None:
     given = [word for word in words if word.startswith(chosen)]
     source = " ".join(given if config.cart else ["cart=ip02", *given])
     cart = config.cart or choice("cart/ip02")
-    numbers = completed({**cart, **pole.heaviest.model_dump()})
+    numbers = completed({**cart, **pole.heaviest_on(cart["cart_mass"]).model_dump()})
     header = rig_header(hardware_of(cart), source, lever_um(numbers))
     write_config(folder, "export", {**config.model_dump(mode="json"), "seed": None})
     write_text(folder / RIG_HEADER, header)

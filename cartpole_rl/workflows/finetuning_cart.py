@@ -156,7 +156,8 @@ class FinetuningCart:
         self.log.scalars({f"link/{key}": float(value) for key, value in link.summary().items()}, step)
         self.log.flush()
         tqdm.write(
-            f"{stage} {number + 1}: score {score:z.0f}, ended by {episode.ended_by}{guard_text(episode)}"
+            f"{stage} {number + 1}: {self.measure} {score:z.0f}, "
+            f"ended by {episode.ended_by}{guard_text(episode)}"
         )
 
     def log_learning(self, curves: Mapping[str, float], learned: int) -> None:

@@ -88,6 +88,8 @@ def recorded_chunks(
 class Finetuning(Training):
     """A training of a trained agent, on simulated carts of a fit and on recordings of a cart."""
 
+    rate_setting = "finetuning.learning_rate"
+
     def __init__(self, finetuning: FinetuningSettings, *arguments: Any, **named: Any) -> None:
         super().__init__(*arguments, **named)
         self.finetuning = finetuning

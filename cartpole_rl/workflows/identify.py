@@ -243,7 +243,7 @@ def record_experiments(config: IdentifyConfig, folder: Path) -> None:
 
 def make_plant(config: IdentifyConfig) -> SerialPlant:
     """Connect to the cart that is identified."""
-    pole = config.pole.heaviest.model_dump()
+    pole = config.pole.nominal.model_dump()
     plant: SerialPlant = config.plant.build(
         config.emulator, config.control_period, "hanging", tqdm.write, confirm, {**config.cart, **pole}
     )

@@ -121,7 +121,7 @@ def preview(config: TrainConfig, folder: Path) -> None:
 def fall_note(scores: Sequence[float]) -> str | None:
     """Return a line if the last evaluation's score is more than a tenth below the best, None if not."""
     best = max(scores, default=0.0)
-    if best <= 0 or scores[-1] >= FALLEN * best:
+    if best <= 0 or scores[-1] >= FALLEN * best or round(scores[-1]) == round(best):
         return None
     return (
         f"note: the last evaluation scored {scores[-1]:.0f}, the best {best:.0f}: the agent became worse; "

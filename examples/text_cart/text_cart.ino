@@ -38,11 +38,12 @@ void setup() {
 }
 
 /* A line is a number from -255 to 255 and nothing else; any other line is ignored. */
-bool motor_value(const char *text, int *motor) {
+bool motor_value(const char *text, unsigned length, int *motor) {
     char *end;
     long value = strtol(text, &end, 10);
+    if (end == text) return false;
     while (*end == '\r' || *end == ' ') end++;
-    if (end == text || *end != '\0' || value < -255 || value > 255) return false;
+    if (end != text + length || value < -255 || value > 255) return false;
     *motor = (int)value;
     return true;
 }
@@ -60,7 +61,7 @@ void loop() {
         }
         if (length < sizeof text) {
             text[length] = '\0';
-            if (motor_value(text, &motor)) {
+            if (motor_value(text, length, &motor)) {
                 drive(motor);
                 heard_ms = millis();
             }

@@ -14,7 +14,7 @@
 /* Distance from such a stop at which the slow search begins. A switch must not be overrun: the cart is slow before. */
 #define TOUCH_ZONE_NM (CART_SWITCHES ? 120000000 : 60000000)
 #define ASTRAY_NM 20000000 /* a motion the wrong way that means a reversed motor or encoder */
-#define FAST_POLE (CART_POLE_COUNTS * 6 / 10) /* counts/s; it may move the cart against its motor: 3.8 rad/s */
+#define FAST_POLE (CART_POLE_COUNTS * 6LL / 10) /* counts/s; it may move the cart against its motor: 3.8 rad/s */
 #define RELEASED CART_COUNTS(30000) /* so far inside the place where it is pressed, any switch is released: 30 mm */
 #define FIRST_SWITCH (CART_SWITCHES & CART_LEFT ? CART_LEFT : CART_SWITCHES)
 #define EXPECTS_RIGHT(homing) \

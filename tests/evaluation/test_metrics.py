@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from cartpole_rl.evaluation.metrics import episode_metrics, interval, summarize
-from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.tasks.episode import Episode, Origin
 
 PERIOD = 0.02
 DEGREE = math.pi / 180
@@ -63,6 +63,8 @@ def test_motor_change_and_margin() -> None:
     assert metrics["motor_reversals_per_s"] == pytest.approx(1 / (3 * PERIOD))
     assert metrics["min_track_margin_m"] == pytest.approx(0.1)
     assert episode_metrics(episode([0, 0], x=[0, 0.5]), 0.4)["min_track_margin_m"] == pytest.approx(-0.1)
+    simulated = replace(episode([0, 0], x=[0, 0.5]), origin=Origin({"track_half_length": 0.35}, {}))
+    assert episode_metrics(simulated, 0.4)["min_track_margin_m"] == pytest.approx(-0.15)
 
 
 def test_a_motor_that_rests_between_two_directions_changes_its_direction_once() -> None:

@@ -59,7 +59,7 @@ def test_it_drives_both_ways_and_stops_when_nobody_speaks(board: "subprocess.Pop
     assert said(board) == (LEFT, 0)  # the watchdog
 
 
-@pytest.mark.parametrize("bad", ["300", "12x", "", "nan", "1" * 40, "--5"])
+@pytest.mark.parametrize("bad", ["300", "12x", "", " ", "\r", "25\0x", "nan", "1" * 40, "--5"])
 def test_it_ignores_what_is_no_motor_value(bad: str, board: "subprocess.Popen[str]") -> None:
     tell(board, f"{bad}\n7\n")
     assert said(board) == (RIGHT, 7)

@@ -338,6 +338,26 @@ def test_a_failed_cart_is_retried(probability: float) -> None:
     assert retries.describe() == {"exploration/score": pytest.approx(7.5), "exploration/episode_length": 10}
 
 
+def test_a_staggered_first_episode_is_too_short_to_have_failed() -> None:
+    task = SimpleNamespace(task=SimpleNamespace(periods=10))
+    env = SimpleNamespace(batch_size=[2], device="cpu", hardware=task)
+    retries = Retries(env, 1.0, torch.Generator())
+    retries.reset(torch.tensor([0, 8]))
+    scores, ends = torch.ones(2, 1), torch.tensor([[True], [True]])
+
+    def step(done: torch.Tensor, count: int) -> torch.Tensor | None:
+        outcome = {"score": 0 * scores, "done": done, "step_count": torch.full((2, 1), count)}
+        return retries.record(TensorDict(outcome, [2]))
+
+    retries._mean_score = 1.0
+    assert step(~ends, 9) is None
+    assert (retry := step(ends, 10)) is not None
+    assert retry.tolist() == [True, False]
+    assert retries.describe()["exploration/episode_length"] == 6  # of 10 and 2 periods
+    assert (retry := step(ends, 10)) is not None
+    assert retry.tolist() == [True, True]
+
+
 def test_a_retried_cart_keeps_its_parameters(make_training: MakeTraining) -> None:
     wide = {"ranges": with_fitted_guard(shipped_settings()).ranges}
     training = always(greedy(make_training(ONCE, plant=wide, time_limit=LIMIT)), 0)

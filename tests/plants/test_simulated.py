@@ -145,6 +145,8 @@ class TestDraws:
         for rows in (track < 0.2, track > 0.3):
             values = share[rows].sort().values
             assert (values - torch.linspace(0, 1, len(values))).abs().max() < 0.03
+        plant.restart(torch.arange(20_000), torch.ones(20_000, dtype=torch.bool))  # the same carts
+        assert (plant.true_state.x.abs() <= spread + 1e-6).all()
         assert not push(plant, 0)["terminated"].any()
 
     def test_are_repeated_by_the_seed(self, make_plant: MakePlant) -> None:

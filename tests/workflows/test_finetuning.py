@@ -172,7 +172,7 @@ def test_an_episode_is_scored_as_its_task_is(
     FinetuningCart(Script(), files, log, "score_upright").keep(
         Stage.BEFORE, 0, replace(EPISODE, score_upright=np.array([3.0, 4.0])), LinkStatistics()
     )
-    assert capsys.readouterr().out == "before 1: score 7, ended by time\n"
+    assert capsys.readouterr().out == "before 1: score_upright 7, ended by time\n"
     assert scalars(files.folder, "cart/score_before") == [(1, 7.0)]
 
 

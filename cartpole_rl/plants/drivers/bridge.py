@@ -19,7 +19,7 @@ from dataclasses import replace
 from itertools import pairwise
 from operator import index
 from statistics import mean, median
-from threading import Lock, Thread
+from threading import Event, Lock, Thread
 from typing import Self
 
 from cartpole_rl.emulator.firmware import LARGEST_MOTOR, WATCHDOG_PERIODS, Firmware
@@ -27,7 +27,7 @@ from cartpole_rl.emulator.guards import FASTEST_CART, FASTEST_POLE, LONGEST_US, 
 from cartpole_rl.emulator.homing import Homing, HomingError, Reading, Window, Zeros, find_hanging
 from cartpole_rl.emulator.link import Channel
 from cartpole_rl.errors import CartPoleError, ConfigError, LinkError, reason_of
-from cartpole_rl.plants.drivers.driver import Driver, Measurement
+from cartpole_rl.plants.drivers.driver import CLOCK_WRAP, Driver, Measurement
 from cartpole_rl.plants.drivers.potentiometer import Potentiometer
 from cartpole_rl.plants.settings import BoardSettings
 from cartpole_rl.rig.hardware import Hardware
@@ -222,7 +222,9 @@ class MotorCommands:
     measured: it follows from what was sent.
     """
 
-    def __init__(self, settings: BoardSettings) -> None:
+    def __init__(self, settings: BoardSettings, creep: float = STANDS) -> None:
+        """`creep` m/s: a cart whose count stands is at rest if it is slower; else its count is dead."""
+        self._creep = max(STANDS, creep)
         self._sends, self._damping = settings.sends, settings.damping
         self._size, self._sign = abs(settings.full), math.copysign(1.0, settings.full)
         self._fastest = settings.fastest
@@ -257,8 +259,7 @@ class MotorCommands:
             self._speed, self._acceleration, self._now = math.copysign(slowed, self._speed), 0.0, now
             return self._sign * self._speed if slowed else None
         self._pass_time(now)
-        if stands is None:
-            stands = abs(self._speed) < STANDS
+        stands = stands is not False and abs(self._speed) < (STANDS if stands is None else self._creep)
         if self._sends == "value" or stands or not (self._speed or self._acceleration):
             self._speed = self._acceleration = 0.0
             return None
@@ -285,7 +286,7 @@ class Bridge:
     ) -> None:
         self._lever = lever
         self._settings, self._hardware, self._driver = settings, hardware, driver
-        self._lock = Lock()
+        self._lock, self._ending = Lock(), Event()
         self._failure: CartPoleError | None = None
         self._booted = time.monotonic()
         self._control_period = control_period
@@ -404,23 +405,26 @@ class Bridge:
             self._lock.release()
 
     def _hear(self) -> None:
-        """Take the frames of the host as they come."""
+        """Take the frames of the host as they come; stop the board while the other thread hangs."""
         assert self._channel is not None
         try:
             while self._failure is None:
                 frames = self._channel.receive(self._stand_in.period_us * 1e-6)
-                with self._lock:
+                with self._one_at_a_time():
                     for frame in frames:
                         self._obey(frame)
-                    self._stand_in_for_reader()
+                    if self._hangs() and self._failure is None:
+                        self._wait(self._now_us())
         except Exception as error:
             self._failure = driver_error(self._settings, error)
+            while not self._ending.wait(self._stand_in.period_us * 1e-6):
+                if self._hangs():  # otherwise that thread raises the failure, and stops the board
+                    with suppress(Exception):
+                        self._driver.stop()
 
-    def _stand_in_for_reader(self) -> None:
-        """Apply the rules of the clock while the driver's `read` does not return."""
-        now_us = self._now_us()
-        if now_us - self._passed_us > HUNG_PERIODS * self._stand_in.period_us and self._failure is None:
-            self._wait(now_us)
+    def _hangs(self) -> bool:
+        """Return True while the driver's `read`, or a command of the reading thread, does not return."""
+        return self._now_us() - self._passed_us > HUNG_PERIODS * self._stand_in.period_us
 
     def _obey(self, frame: bytes | None) -> None:
         if frame is None or self._failure is not None:
@@ -472,7 +476,7 @@ class Bridge:
         """Note a measurement; return False for one that is implausible: damaged on the way, or repeated."""
         try:
             cart, pole = index(given.cart), index(given.pole)
-            us = now_us if given.us is None else index(given.us)
+            us = now_us if given.us is None else self._unwrapped(index(given.us))
         except TypeError:
             return self._refuse(f"{given} is not in whole counts and us")
         settings, last = self._settings, self._last
@@ -509,6 +513,11 @@ class Bridge:
             self._begin(self._board_us)
         self._pole = new.pole
         return self._accept(new, pole, now_us)
+
+    def _unwrapped(self, us: int) -> int:
+        """Return the board's time without the wrap of a 32-bit counter."""
+        last = self._last.us if self._last is not None and self._last.us is not None else us
+        return last + (us - last + CLOCK_WRAP // 2) % CLOCK_WRAP - CLOCK_WRAP // 2
 
     def _fits(self, last: Measurement, new: Measurement, arrived: int, refused: int = 0) -> bool:
         """Return True if a cart can move from one measurement to the other; `arrived` us lie between at most.
@@ -559,14 +568,18 @@ class Bridge:
         self._stand_in = StandIn(self._settings, self._hardware, board_us, self._driver, self._lever)
         self._clock, self._measured = BoardClock(board_us), 0
         self._recent.clear()
-        self._commands = MotorCommands(self._settings)
+        self._commands = self._new_commands()
         self._potentiometer.forget()
+
+    def _new_commands(self) -> MotorCommands:
+        """Return the commands of a cart at rest, whose speed is known to a count a measurement."""
+        return MotorCommands(self._settings, self._hardware.encoders.metres / self._board_us * 1e6)
 
     def _command(self, silent: bool = False) -> None:
         """Send what drives the board, or what stops it, also while no measurement comes (`silent`)."""
         stand_in, now_us = self._stand_in, self._now_us()
         if stand_in.board_homes:
-            self._commands = MotorCommands(self._settings)  # what was sent before counts no more
+            self._commands = self._new_commands()  # what was sent before counts no more
             self._stops_left = STOPS  # for a homing that is ended
             return
         if stand_in.is_active:
@@ -610,6 +623,7 @@ class Bridge:
     def __exit__(self, kind: object, why: BaseException | None, traceback: object) -> None:
         """Stop the board, whatever has happened; signals wait until then. Raises LinkError if it cannot."""
         unstopped: Exception | None = None
+        self._ending.set()
         for number in (signal.SIGINT, *ending_signals()):
             signal.signal(number, signal.SIG_IGN)
         free = self._lock.acquire(timeout=LONGEST_CALL)  # and not given back: nothing else may be sent
@@ -632,8 +646,7 @@ class Bridge:
             ) from unstopped
 
     def _slow_down(self) -> None:
-        deadline, silent = time.monotonic() + STOPPING, False
-        hangs = self._now_us() - self._passed_us > HUNG_PERIODS * self._stand_in.period_us
+        deadline, silent, hangs = time.monotonic() + STOPPING, False, self._hangs()
         while time.monotonic() < deadline:
             command = self._commands.slowing(self._now_us() * 1e-6, self._stands(silent))
             if command is None:

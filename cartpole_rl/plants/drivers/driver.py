@@ -15,12 +15,15 @@ if TYPE_CHECKING:
     from cartpole_rl.rig.hardware import Encoders
 
 
+CLOCK_WRAP = 2**32  # of micros() and millis()
+
+
 class Measurement(NamedTuple):
     """One measurement of a board. Counts grow to the right, from any zero."""
 
     cart: int  # counts
     pole: int  # counts; may wrap at a whole turn
-    us: int | None = None  # when it was measured, by the board's clock; None if the board does not say
+    us: int | None = None  # when it was measured, by the board's clock, which may wrap at 2^32; None: unknown
 
 
 class Driver(ABC):

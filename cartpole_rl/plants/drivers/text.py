@@ -14,7 +14,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from cartpole_rl.errors import LinkError
-from cartpole_rl.plants.drivers.driver import Driver, Measurement
+from cartpole_rl.plants.drivers.driver import CLOCK_WRAP, Driver, Measurement
 from cartpole_rl.plants.serial.port import open_port, resolved_port, set_exclusive
 from cartpole_rl.rig.hardware import Encoders
 
@@ -28,7 +28,6 @@ FEW_LINES, QUEUED = 3, 0.1  # lines and s: so many that wait for so long are too
 WHOLE = re.compile(r"[+-]?[0-9]+")
 NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)(e[+-]?[0-9]+)?", re.IGNORECASE)
 LARGEST_COUNT = 2**31
-CLOCK_WRAP = 2**32  # of micros() and millis()
 MICROSECONDS = {"us": 1, "ms": 1_000, "s": 1_000_000}
 
 
@@ -47,6 +46,7 @@ class TextDriver(Driver):
         ]
         self._line: serial.SerialBase | None = None
         self._pending = b""
+        self._dropping = False  # until the next line: this one is too long
         self._queued_since: float | None = None  # when lines began to wait in the system's buffer
         self._cut = False  # the last line was perhaps sent in part
         self._clock: tuple[int, int] | None = None  # the newest time in the board's unit, and unwrapped in us
@@ -56,7 +56,7 @@ class TextDriver(Driver):
         """Open the port. Raises PortError."""
         self.port = resolved_port(self.settings.port)
         self._line = open_port(self.port, self.settings.baud, self.settings.write_timeout)
-        self._pending = b""
+        self._pending, self._dropping = b"", False
 
     def read(self, timeout: float) -> Measurement | None:
         """Return the next whole line as a measurement; None if none came within `timeout` s."""
@@ -64,14 +64,16 @@ class TextDriver(Driver):
         while True:
             while b"\n" in self._pending:
                 line, _, self._pending = self._pending.partition(b"\n")
-                if (measurement := self._measured(line)) is not None:
+                dropped, self._dropping = self._dropping, False
+                if not dropped and (measurement := self._measured(line)) is not None:
                     return measurement
             if time.monotonic() >= deadline:
                 return None
             self._pending += self._received(deadline)
             if len(self._pending) > LONGEST_LINE and b"\n" not in self._pending:
-                self._refuse(self._pending)
-                self._pending = b""
+                if not self._dropping:
+                    self._refuse(self._pending)
+                self._pending, self._dropping = b"", True
 
     def send(self, value: float) -> None:
         """Send the line of a motor command."""

@@ -144,4 +144,5 @@ def check_limits(information: Info, hardware: Hardware) -> None:
 
 def limit_range(hardware: Hardware) -> tuple[float, float]:
     """Return what the soft limit has to be beyond, and the hard limit within, in m from the middle."""
-    return 0.5 * hardware.half_span, (1 + SPAN_TOLERANCE) * hardware.half_span
+    # on the shortest track that homing accepts, the largest soft limit leaves so much
+    return (0.5 - SPAN_TOLERANCE) * hardware.half_span, (1 + SPAN_TOLERANCE) * hardware.half_span

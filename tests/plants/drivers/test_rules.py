@@ -157,6 +157,31 @@ def test_a_stepper_is_left_standing(speed: float, latency: int, monkeypatch: pyt
     assert (len(bridge.played.sent), bridge.played.stops) == (sent, stops)
 
 
+def test_a_stepper_whose_count_froze_is_slowed_down_by_what_was_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+    bridge = Playing(sends="acceleration", full=12.0, fastest=2.0)
+    bridge.drive(0, monkeypatch)
+    bridge.measure(*range(0, 800, 80))  # 0.2 m/s
+    bridge._stand_in.armed = False
+    monkeypatch.setattr(StandIn, "is_active", True)
+    bridge.drive(10, monkeypatch)
+    bridge._stand_in.armed = False
+    bridge.measure(*[720] * 60)  # 0.5 m/s^2 for 0.6 s
+    bridge.played.sent.clear()
+    monkeypatch.setattr(StandIn, "is_active", False)
+    bridge.measure(*[720] * 200)
+    assert sum(bridge.played.sent) * 0.01 == pytest.approx(-0.4, abs=0.1)  # m/s
+
+
+def test_a_board_whose_clock_wraps_has_not_restarted() -> None:
+    bridge = Playing()
+    for number in range(-5, 5):
+        bridge.now += PERIOD_US
+        bridge._pass(Measurement(0, 0, number * PERIOD_US % 2**32))
+    assert bridge.played.bad == 0
+    assert bridge._last is not None
+    assert bridge._last.us == 2**32 + 4 * PERIOD_US
+
+
 def test_a_stepper_that_takes_speeds_is_slowed_down_and_not_stopped_at_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -419,6 +444,32 @@ def test_a_read_that_does_not_return_leaves_no_motor_on(monkeypatch: pytest.Monk
     with pytest.raises(LinkError, match=r"^stopped$"), bridge:
         bridge.run(Frames())  # type: ignore[arg-type]
     assert bridge._stand_in.motor == 0
+
+
+@pytest.mark.usefixtures("same_signals")
+@pytest.mark.parametrize("hangs", ["read", "send"])
+def test_stopping_a_board_goes_on_while_the_reading_thread_hangs(
+    hangs: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bridge, stopped, stops = Playing(), Event(), iter(range(10**6))
+    bridge.measure(0, 0)
+    bridge.drive(200, monkeypatch)
+    monkeypatch.setattr(bridge, "_now_us", lambda: Bridge._now_us(bridge))
+    monkeypatch.setattr(bridge, "_wait", lambda now_us: bridge.played.stop())
+
+    def stop() -> None:
+        if next(stops) == 0:
+            raise OSError("no buffer space, once")
+        stopped.set()
+
+    def hang(value: float) -> None:
+        raise LinkError("stopped" if stopped.wait(30) else "still on")
+
+    monkeypatch.setattr(bridge.played, "stop", stop)
+    monkeypatch.setattr(bridge.played, hangs, hang)
+    bridge.played.script = [Measurement(0, 0, 3 * PERIOD_US)]
+    with pytest.raises(LinkError, match=r"^stopped$"), bridge:
+        bridge.run(Frames())  # type: ignore[arg-type]
 
 
 @pytest.mark.usefixtures("same_signals")

@@ -131,6 +131,13 @@ def test_a_line_may_come_in_pieces(line: Line) -> None:
     assert line.read(b"0,5,6\n") == Measurement(5, 6, 40)
 
 
+def test_the_end_of_a_line_that_is_too_long_is_no_line(line: Line) -> None:
+    assert line.read(b"9" * 205, timeout=0.05) is None
+    assert line.read(b"9000,100,200\n", timeout=0.05) is None
+    assert line.driver.bad == 1
+    assert line.read(b"10,20,30\n") == Measurement(20, 30, 10)
+
+
 def test_a_clock_of_32_bits_goes_on_when_it_wraps(line: Line) -> None:
     first, second = line.read(b"4294967290,0,0\n"), line.read(b"4,0,0\n")
     assert first is not None
