@@ -20,7 +20,7 @@ from cartpole_rl.identification.settings import ImportConfig, log_files, logs_in
 from cartpole_rl.plants.settings import emulated_pole
 from cartpole_rl.randomization.poles import Pole, check_one_pole
 from cartpole_rl.randomization.ranges import check_carts
-from cartpole_rl.rig.hardware import check_track, hardware_of, parameters_of
+from cartpole_rl.rig.hardware import check_track, parameters_of
 from cartpole_rl.rig.parameters import check_names, check_value, check_values, completed
 from cartpole_rl.run_folder import (
     BASELINE,
@@ -196,7 +196,7 @@ def check_replay(config: ReplayConfig) -> None:
     recordings(config.source)
     if config.pole is not None:
         check_one_pole("a replay", config.pole)
-    hardware_of(config.cart or {})
+    check_track(config.cart or {})
     check_parameters({**parameters_of(config.cart or {}), **(config.parameters or {})})
 
 
@@ -211,6 +211,7 @@ def check_modelling(config: ModelConfig) -> None:
 def check_identification(config: IdentifyConfig) -> None:
     """Raise CartPoleError if the prior cart is impossible, or there is no recording."""
     check_values(config.nominal)
+    check_track(config.cart)
     if config.source is not None:
         experiments(config.source)
     elif config.plant.reads_emulator:

@@ -16,8 +16,8 @@ from cartpole_rl.composition import compose
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.rig.hardware import parameters_of
 from cartpole_rl.workflows.build import evaluated_agent, own_training, replaced_settings
-from cartpole_rl.workflows.checks import check_training, note_other_numbers
-from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig, load_settings
+from cartpole_rl.workflows.checks import check_identification, check_training, note_other_numbers
+from cartpole_rl.workflows.config import EvaluateConfig, IdentifyConfig, TrainConfig, load_settings
 
 IP02 = choice("cart/ip02")
 VISCOUS = "cart_viscous"
@@ -253,7 +253,8 @@ def test_an_exported_agent_is_checked_against_the_cart_that_it_drives(
     ],
 )
 def test_a_cart_in_other_units_is_refused(cart: dict[str, float], message: str) -> None:
+    given = {f"cart.{name}": each for name, each in cart.items()}
     with pytest.raises(ConfigError, match=message):
-        check_training(
-            load_settings(TrainConfig, {f"cart.{name}": each for name, each in cart.items()}), Path(), []
-        )
+        check_training(load_settings(TrainConfig, given), Path(), [])
+    with pytest.raises(ConfigError, match=message):
+        check_identification(load_settings(IdentifyConfig, given))
