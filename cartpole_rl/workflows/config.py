@@ -150,16 +150,16 @@ class TrainConfig(RunSettings, CartPoleSettings):
             raise ValueError(
                 f"buffer.size {self.buffer.size} must be at least learning.batch_size {learning.batch_size}"
             )
-        if self.buffer.size < (collected := learning.carts * learning.chunk):
-            raise ValueError(
-                f"buffer.size {self.buffer.size} must be at least {collected}, the transitions that are "
-                "collected at once (learning.carts times learning.chunk)"
-            )
         return self
 
     def check_learning(self) -> None:
         """Raise ConfigError for a new training that would learn nothing, or use shorter returns."""
         learning = self.learning.at(self.control_period)
+        if self.buffer.size < (collected := learning.carts * learning.chunk):
+            raise ConfigError(
+                f"buffer.size {self.buffer.size} must be at least {collected}, the transitions that are "
+                "collected at once (learning.carts times learning.chunk)"
+            )
         if learning.collected_transitions <= (warmup := learning.warmup_transitions):
             chunk = learning.carts * learning.chunk
             raise ConfigError(

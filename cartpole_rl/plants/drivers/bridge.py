@@ -420,7 +420,18 @@ class Bridge:
             while not self._ending.wait(self._stand_in.period_us * 1e-6):
                 if self._hangs():  # otherwise that thread raises the failure, and stops the board
                     with suppress(Exception):
-                        self._driver.stop()
+                        self._stop_again()
+
+    def _stop_again(self) -> None:
+        """Stop the board, whatever the last stop did; slow a stepper down first if `send` is free."""
+        if self._settings.sends == "value" or not self._lock.acquire(blocking=False):
+            self._driver.stop()
+            return
+        try:
+            self._stops_left = STOPS
+            self._wait(self._now_us())
+        finally:
+            self._lock.release()
 
     def _hangs(self) -> bool:
         """Return True while the driver's `read`, or a command of the reading thread, does not return."""

@@ -473,6 +473,29 @@ def test_stopping_a_board_goes_on_while_the_reading_thread_hangs(
 
 
 @pytest.mark.usefixtures("same_signals")
+def test_a_stepper_is_slowed_down_while_the_reading_thread_hangs(monkeypatch: pytest.MonkeyPatch) -> None:
+    bridge, stopped, fails = Playing(sends="acceleration", full=12.0, fastest=2.0), Event(), iter([True])
+    bridge.measure(*range(0, 4000, 400))  # 1 m/s
+    monkeypatch.setattr(bridge, "_now_us", lambda: bridge.now + Bridge._now_us(bridge))
+    sent: list[float] = []
+
+    def send(value: float) -> None:
+        if next(fails, False):
+            raise OSError("no buffer space, once")
+        sent.append(value)
+
+    def hang(timeout: float) -> None:
+        raise LinkError("stopped" if stopped.wait(30) else "still on")
+
+    monkeypatch.setattr(bridge.played, "send", send)
+    monkeypatch.setattr(bridge.played, "stop", stopped.set)
+    monkeypatch.setattr(bridge.played, "read", hang)
+    with pytest.raises(LinkError, match=r"^stopped$"), bridge:
+        bridge.run(Frames())  # type: ignore[arg-type]
+    assert sent  # it was not stopped at once, which would let it roll
+
+
+@pytest.mark.usefixtures("same_signals")
 def test_a_command_that_does_not_return_keeps_nobody_from_stopping_the_board() -> None:
     bridge = Playing()
     bridge._lock.acquire()  # as the thread that hangs in `send`
