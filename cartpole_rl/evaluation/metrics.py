@@ -76,7 +76,7 @@ def _reversals_per_s(episode: Episode) -> float | None:
     """Return how often a motor value has another sign than the last one that was not 0."""
     directions = np.sign(episode.motor[episode.motor != 0])
     seconds = float(episode.time[-1] - episode.time[0])
-    return np.count_nonzero(np.diff(directions)) / seconds if seconds > 0 else None
+    return float(np.count_nonzero(np.diff(directions))) / seconds if seconds > 0 else None
 
 
 def _rms(values: np.ndarray) -> float | None:

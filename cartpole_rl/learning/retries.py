@@ -69,6 +69,6 @@ class Retries:
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Restore the state in `snapshot`."""
         self._score = snapshot["score"].to(self.env.device, copy=True)
-        if "begun" in snapshot:  # missing in earlier versions
-            self._begun = snapshot["begun"].to(self.env.device, copy=True)
+        begun = snapshot.get("begun", torch.zeros_like(self._begun))  # missing in earlier versions
+        self._begun = begun.to(self.env.device, copy=True)
         self._mean_score, self._ended = snapshot["mean_score"], list(snapshot["finished"])

@@ -10,7 +10,7 @@ from torch import Tensor
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.plants.specs import TERMINATING, TRUNCATING, Numbers, OneCartPlant, PlantOutput
 from cartpole_rl.rig.hardware import Hardware
-from cartpole_rl.tasks.episode import Ending, Episode
+from cartpole_rl.tasks.episode import Episode
 
 
 class RecordedPlant(OneCartPlant):
@@ -58,6 +58,5 @@ class RecordedPlant(OneCartPlant):
         since = float(episode.time[row] - episode.time[max(0, row - 1)])
         motor = int(episode.motor[row - 1]) if row else 0
         ending = episode.ended_by if row == episode.steps else ""
-        # what ended it holds: in other arithmetic, a pole right at its limit has not fallen
-        ends = (ending in (*TERMINATING, Ending.ANGLE),), (ending in TRUNCATING,)
+        ends = (ending in TERMINATING,), (ending in TRUNCATING,)
         return PlantOutput((cart, pole), (since,), (motor,), *ends)

@@ -77,7 +77,7 @@ class Hardware(Settings):
         if self.encoders.cart_counts(self.soft_limit) <= self.encoders.cart_counts(self.hard_limit):
             raise ValueError(
                 f"hard_limit {self.hard_limit:g} m and soft_limit {self.soft_limit:g} m are the same count; "
-                f"give limits that are {self.encoders.metres:g} m apart"
+                f"give limits that are more than {self.encoders.metres:g} m apart"
             )
         return self
 

@@ -26,7 +26,7 @@ from cartpole_rl.learning.settings import DistillationSettings, half_cosine
 from cartpole_rl.learning.states import seed_everything
 from cartpole_rl.reporting.episodes import report_episodes
 from cartpole_rl.run_folder import CHECKPOINTS, FIGURES, LAST, METRICS, write_config
-from cartpole_rl.terminal import as_word, print_results, progress_bar, shown
+from cartpole_rl.terminal import as_word, print_message, print_results, progress_bar, shown
 from cartpole_rl.workflows.build import new_agent, provenance, trained_agent, use_threads
 from cartpole_rl.workflows.config import DistillConfig, TrainConfig
 from cartpole_rl.workflows.train import judge, nominal_env
@@ -62,7 +62,10 @@ def distill(config: DistillConfig, folder: Path) -> float:
             progress.update()
     episodes = judge(nominal_env(training), student.greedy_policy(), config.seed)
     score = mean([episode.total(training.task.measure) for episode in episodes])
-    agent = AgentCheckpoint(settings, student.state_dict(), distillation.transitions, score)
+    tuned_poles = [poles.model_dump(mode="json") for poles in teacher.known_poles[1:]]
+    agent = AgentCheckpoint(settings, student.state_dict(), distillation.transitions, score, tuned_poles)
+    if tuned_poles:
+        print_message("distill", "note: the teacher was fine-tuned on a pole that the student did not see")
     save_agent(folder / CHECKPOINTS / LAST, agent)
     report_episodes(folder, episodes, training.plant.kind, training.pole, training.task)
     print(f"a network of {list(config.hidden)} hidden units scores {score:z.0f}")

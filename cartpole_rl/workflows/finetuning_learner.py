@@ -42,7 +42,7 @@ from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.randomization.randomizer import Draws
 from cartpole_rl.rig.hardware import Hardware
 from cartpole_rl.settings import evaluation_seed
-from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.tasks.episode import Ending, Episode
 from cartpole_rl.terminal import print_message
 from cartpole_rl.workflows.build import known_poles, new_agent
 from cartpole_rl.workflows.config import FinetuneConfig, TrainConfig
@@ -75,9 +75,14 @@ def recorded_chunks(
     current = env.reset()
     parts: list[list[TensorDictBase]] = [[]]
     regular = episode.regular_frames(float(np.median(np.diff(episode.time))) if episode.steps else 1.0)
-    for motor, in_time in zip(episode.motor[: episode.measured_steps].tolist(), regular, strict=False):
+    motor_values = episode.motor[: episode.measured_steps].tolist()
+    for row, (motor, in_time) in enumerate(zip(motor_values, regular, strict=False), start=1):
         current["action"] = torch.tensor([index.get(motor, 0)])
         transition, current = env.step_and_maybe_reset(current)
+        if row == episode.steps and episode.ended_by == Ending.ANGLE:
+            # that holds: in other arithmetic, a pole right at its limit has not fallen
+            transition["next", "terminated"].fill_(True)
+            transition["next", "done"].fill_(True)
         if in_time and motor in index:
             parts[-1].append(transition.select(*COLLECTED))
         else:

@@ -7,6 +7,7 @@ import math
 import statistics
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import closing
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -187,12 +188,16 @@ def as_recorded(config: IdentifyConfig, words: Sequence[str]) -> IdentifyConfig:
     if names and "cart" not in keys:  # they change the recorded cart
         changed = {name: given["cart"][name] for name in names}
         taken = {"cart": {**recorded.get("cart", given["cart"]), **changed}, **taken}
-    of_pole = next((word for word in words if key_of(word).startswith("pole.")), None)
-    own, theirs = (list(each.get("pole", {}).get("choices") or ()) for each in (given, recorded))
-    if of_pole and "pole" not in keys and own != theirs != []:
-        raise ConfigError(
-            f"{of_pole}: from={config.source} has the pole {', '.join(theirs)}; give pole= with it"
-        )
+    of_pole = [key for key in keys if key.startswith("pole.")]
+    if of_pole and "pole" not in keys:  # they change the recorded pole
+        pole = deepcopy(recorded.get("pole", given["pole"]))
+        for key in of_pole:
+            choices, name, number = [*key.split(".")[1:], "", ""][:3]
+            if choices != "choices" or not number or name not in (pole.get("choices") or {}):
+                own = ", ".join(pole.get("choices") or ("given by its length",))
+                raise ConfigError(f"{key}=: from={config.source} has the pole {own}; give pole= with it")
+            pole["choices"][name][number] = given["pole"]["choices"][name][number]
+        taken = {"pole": pole, **taken}
     if taken:
         print_message("identify", f"note: {' and '.join(taken)} as in from={config.source}")
     return recorded_settings(IdentifyConfig, {**given, **taken}, f"from={config.source}")

@@ -37,6 +37,7 @@ from cartpole_rl.workflows.poles import emulated_words, words_of_run
 
 ROUNDING = 1e-6  # share: that of float32
 FALLEN = 0.9  # of the best score: a training that ends below it says so
+LEAST = 10.0  # score of an agent that has learned something
 
 
 @waiting("preparing: fitting the track guard, compiling")
@@ -121,7 +122,7 @@ def preview(config: TrainConfig, folder: Path) -> None:
 def fall_note(scores: Sequence[float]) -> str | None:
     """Return a line if the last evaluation's score is more than a tenth below the best, None if not."""
     best = max(scores, default=0.0)
-    if best <= 0 or scores[-1] >= FALLEN * best or round(scores[-1]) == round(best):
+    if best < LEAST or scores[-1] >= FALLEN * best:
         return None
     return (
         f"note: the last evaluation scored {scores[-1]:.0f}, the best {best:.0f}: the agent became worse; "

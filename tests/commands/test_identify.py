@@ -18,8 +18,8 @@ from cartpole_rl.identification.experiments import recording
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.rig.hardware import nominal_encoders
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.workflows.config import TrainConfig
-from cartpole_rl.workflows.identify import split
+from cartpole_rl.workflows.config import IdentifyConfig, TrainConfig, load_settings
+from cartpole_rl.workflows.identify import as_recorded, split
 
 
 @pytest.fixture(scope="module")
@@ -186,6 +186,16 @@ def test_a_recording_of_no_cart_gives_no_cart(
     assert not (tmp_path / "out").exists()
 
 
+def test_words_for_a_pole_change_that_of_the_run(run: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(run, tmp_path / "run", ignore=shutil.ignore_patterns("figures"))
+    recorded = yaml.safe_load((folder / "config.yaml").read_text())
+    recorded["pole"]["choices"]["medium"]["pole_com"] = 0.2
+    (folder / "config.yaml").write_text(yaml.safe_dump(recorded))
+    words = [f"from={folder}", "pole.choices.medium.pole_mass=0.13"]
+    pole = as_recorded(load_settings(IdentifyConfig, words), words).pole.nominal
+    assert (pole.pole_mass, pole.pole_com) == (0.13, 0.2)
+
+
 @pytest.mark.usefixtures("without_pictures")
 def test_an_agent_trains_on_what_was_found(run: Path, tmp_path: Path) -> None:
     run = shutil.copytree(run, tmp_path / "moved")  # a run folder can be moved
@@ -220,7 +230,7 @@ def test_an_agent_trains_on_what_was_found(run: Path, tmp_path: Path) -> None:
         ("identify from=run control_period=0.01", "a frame every 20 ms, not every 10 ms"),
         (
             "identify from=large pole.choices.medium.pole_mass=0.12",
-            "pole.choices.medium.pole_mass=0.12: from=large has the pole large; give pole= with it",
+            "pole.choices.medium.pole_mass=: from=large has the pole large; give pole= with it",
         ),
     ],
 )

@@ -119,5 +119,5 @@ def test_a_training_that_became_worse_says_so() -> None:
     assert fall_note([100, 9077, 8200]) is None
     assert "scored 1248, the best 9077" in str(fall_note([100, 9077, 1248]))
     assert fall_note([-1.0, -2.0]) is None  # it never scored
-    assert fall_note([2.4, 1.6]) is None  # both are 2 in the line
+    assert fall_note([1.0, 0.1]) is None  # nor did this one
     assert fall_note([]) is None

@@ -1,7 +1,6 @@
 """A recording played back means what the cart meant when it was recorded."""
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import torch
 from tensordict import TensorDictBase
@@ -37,20 +36,6 @@ def test_played_back_frames_are_understood_as_the_first_time(
         torch.testing.assert_close(following["score"].item(), float(episode.score[row]))
         present = following.exclude("reward")
     assert following["terminated"].item()
-
-
-def test_a_recorded_fall_stays_one_although_its_angle_is_none(
-    make_plant: Callable[..., SimulatedPlant], make_environment: Callable[..., CartPoleEnv]
-) -> None:
-    """Other arithmetic may see a pole that is right at its limit on the other side of it."""
-    env = make_environment(make_plant(1), MOTORS, time_limit=20)
-    (episode,) = run_batch(env, lambda present: present.set("action", torch.tensor([1])))
-    again = make_environment(RecordedPlant(replace(episode, ended_by="angle"), None), MOTORS)
-    present, fallen = again.reset(), []
-    for _ in range(episode.steps):
-        present = again.step(present.set("action", torch.tensor([1])))["next"].exclude("reward")
-        fallen.append(present["terminated"].item())
-    assert fallen == [False] * (episode.steps - 1) + [True]
 
 
 def test_it_keeps_the_contract(

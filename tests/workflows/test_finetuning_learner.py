@@ -156,6 +156,16 @@ def test_unmeasured_transitions_are_left_out(over: Over, drive: Callable) -> Non
     assert recorded_chunks(only, over, MOTORS, None) == []
 
 
+def test_a_recorded_fall_stays_one_although_its_angle_is_none(over: Over, drive: Callable) -> None:
+    """Other arithmetic may see a pole that is right at its limit on the other side of it."""
+    episode, _ = drive({})
+    fallen = replace(episode, ended_by="angle")
+    (whole,), (chunk,) = (recorded_chunks(each, over, MOTORS, None) for each in (episode, fallen))
+    for name in ("terminated", "done"):
+        assert chunk["next", name].flatten().tolist() == [False] * (episode.steps - 1) + [True]
+    assert torch.equal(chunk["next", "reward"], whole["next", "reward"])  # no penalty of the track's end
+
+
 def test_a_length_that_is_observed_but_not_known_is_an_error(over: Over, drive: Callable) -> None:
     with pytest.raises(ConfigError, match="observes the pole's length"):
         recorded_chunks(drive({})[0], partial(over, pole_length=True), MOTORS, None)

@@ -50,6 +50,7 @@ SILENT_PERIODS = 3  # control periods without a measurement, after which the mot
 STOPS = 3  # lines that stop a board; the first may be damaged
 STOPPING = 2.0  # s that a cart which does not stop at the value 0 is given to stop
 STANDS = 1e-3  # m/s, of a cart whose speed is known from what was sent alone
+LARGEST_CREEP = 0.02  # m/s, that a coarse count shows of a cart that stands
 STANDS_US, STANDS_COUNTS = 500_000, 1  # a measured cart stands if its count stays so near one for this time
 SETTLING = 0.1  # s: how fast such a cart is braked
 EARLY_US = 50_000  # a time stamp that lies so far after the arrival is damaged
@@ -260,7 +261,7 @@ class MotorCommands:
             return self._sign * self._speed if slowed else None
         self._pass_time(now)
         stands = stands is not False and abs(self._speed) < (STANDS if stands is None else self._creep)
-        if self._sends == "value" or stands or not (self._speed or self._acceleration):
+        if self._sends == "value" or stands:
             self._speed = self._acceleration = 0.0
             return None
         self._acceleration = -math.copysign(min(self._size, abs(self._speed) / SETTLING), self._speed)
@@ -424,12 +425,13 @@ class Bridge:
 
     def _stop_again(self) -> None:
         """Stop the board, whatever the last stop did; slow a stepper down first if `send` is free."""
-        if self._settings.sends == "value" or not self._lock.acquire(blocking=False):
+        if not self._lock.acquire(blocking=False):  # the other thread hangs in the driver
             self._driver.stop()
             return
         try:
-            self._stops_left = STOPS
-            self._wait(self._now_us())
+            if not self._ending.is_set():
+                self._stops_left = STOPS
+                self._wait(self._now_us())
         finally:
             self._lock.release()
 
@@ -517,7 +519,7 @@ class Bridge:
         if len(self._suspects) < CONFIRMED:
             return self._refuse(f"its numbers jump: {last}, then {new}")
         assert last.us is not None
-        if self._stand_in.board_homes and us > last.us:
+        if self._stand_in.board_homes and 0 < us - last.us <= longest_gap(now_us - self._arrived_us):
             self._stand_in.recount()
             self._recent.clear()
         else:
@@ -538,7 +540,7 @@ class Bridge:
         assert last.us is not None
         assert new.us is not None
         passed = new.us - last.us
-        if passed <= 0 or passed > 2 * arrived + 1_000_000:
+        if passed <= 0 or passed > longest_gap(arrived):
             return False
         passed = max(passed - refused * self._board_us, self._board_us)
         way = (abs(new.cart - last.cart) - 1) * self._hardware.cart_nanometres_per_count
@@ -584,7 +586,8 @@ class Bridge:
 
     def _new_commands(self) -> MotorCommands:
         """Return the commands of a cart at rest, whose speed is known to a count a measurement."""
-        return MotorCommands(self._settings, self._hardware.encoders.metres / self._board_us * 1e6)
+        creep = self._hardware.encoders.metres / self._board_us * 1e6
+        return MotorCommands(self._settings, min(creep, LARGEST_CREEP))
 
     def _command(self, silent: bool = False) -> None:
         """Send what drives the board, or what stops it, also while no measurement comes (`silent`)."""
@@ -687,6 +690,11 @@ class Bridge:
 
     def _now_us(self) -> int:
         return int((time.monotonic() - self._booted) * 1e6)
+
+
+def longest_gap(arrived: int) -> int:
+    """Return the longest time, us by the board, between two measurements that arrived so many us apart."""
+    return 2 * arrived + 1_000_000
 
 
 def driver_error(settings: BoardSettings, error: Exception) -> CartPoleError:

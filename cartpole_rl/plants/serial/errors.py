@@ -137,7 +137,8 @@ def check_limits(information: Info, hardware: Hardware) -> None:
     if not least < soft < hard < most:
         raise NotReadyError(
             f"INFO says soft limit {soft * 1e3:.0f} mm, hard limit {hard * 1e3:.0f} mm from the middle; the "
-            f"soft one comes first, and both in the outer half of the {half_span * 1e3:.0f} mm to a stop",
+            f"soft one comes first, beyond {least * 1e3:.0f} mm, and both before the stop, at "
+            f"{half_span * 1e3:.0f} mm",
             "correct the firmware's limits",
         )
 
