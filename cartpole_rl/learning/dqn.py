@@ -93,12 +93,12 @@ class Training(Resumable):
         nothing corrects an agent that begins to leave the pole hanging until all start again.
         """
         self.current = self.env.reset()
-        self.retries.reset()
+        begun: Tensor | int = 0
         if self.staggers:
             carts, periods = self.settings.carts, self.env.hardware.task.periods
             begun = torch.arange(carts, device=self.env.device) * periods // carts
             self.current["step_count"] = begun.unsqueeze(1)
-            self.retries.reset(begun)
+        self.retries.reset(begun)
         self.waiting: TensorDictBase | None = None  # [N, n - 1], the last periods if their returns go on
 
     @property

@@ -75,16 +75,6 @@ class PoleSettings(Settings):
         assert self.lengths is not None
         return Pole.rod(sum(self.lengths) / 2)
 
-    def heaviest_on(self, cart_mass: float) -> Pole:
-        """Return the pole that shakes a cart of `cart_mass` kg most: of the choices, or the longest rod."""
-        if self.choices is None:
-            assert self.lengths is not None
-            return Pole.rod(self.lengths[1])
-        return max(
-            self.choices.values(),
-            key=lambda pole: pole.pole_mass * pole.pole_com / (cart_mass + pole.pole_mass),
-        )
-
     @property
     def is_single(self) -> bool:
         """True if every cart carries the same pole."""

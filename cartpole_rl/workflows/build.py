@@ -13,6 +13,7 @@ import yaml
 from cartpole_rl.agents.baseline import EnergyAndRegulator
 from cartpole_rl.agents.own import OwnPolicy
 from cartpole_rl.checking import validated
+from cartpole_rl.emulator.guards import lever_um
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.envs.build import environment, simulated_env, with_fitted_guard, with_guard_numbers
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
@@ -26,7 +27,7 @@ from cartpole_rl.plants.serial.preparation import Confirm, StartPosition, nobody
 from cartpole_rl.plants.settings import PlantSettings
 from cartpole_rl.randomization.poles import Pole, PoleSettings, check_one_pole
 from cartpole_rl.rig.hardware import Hardware, hardware_of
-from cartpole_rl.rig.parameters import check_names
+from cartpole_rl.rig.parameters import check_names, completed
 from cartpole_rl.run_folder import (
     BASELINE,
     CHECKPOINTS,
@@ -339,14 +340,19 @@ def evaluated_env(
         raise ConfigError("task.evaluation_start.angle=any: a cart can start only upright or hanging")
     angle: StartPosition = "upright" if start.angle is Start.UPRIGHT else "hanging"
     emulator = config.emulator.model_copy(update={"seed": config.emulator.seed + config.seed})
-    pole = settings.pole.heaviest_on(settings.cart["cart_mass"])
-    numbers = {**settings.cart, **pole.model_dump()}
+    numbers = with_shaking_pole(settings.cart, settings.pole)
     plant = config.plant.build(emulator, settings.control_period, angle, prompt, confirm, numbers)
     try:
         return environment(settings, plant)
     except BaseException:
         plant.close()
         raise
+
+
+def with_shaking_pole(cart: Mapping[str, float], poles: PoleSettings) -> dict[str, float]:
+    """Return the numbers of a cart with the pole that shakes it most: the one with the longest lever."""
+    rigs = [{**cart, **pole.model_dump()} for pole in (poles.each.choices or {}).values()]
+    return max(rigs, key=lambda numbers: lever_um(completed(numbers)))
 
 
 def precedence(plant: PlantSettings, emulator: EmulatorSettings) -> AbstractContextManager[None]:

@@ -28,6 +28,7 @@ from cartpole_rl.workflows.build import (
     provenance,
     recorded_cart,
     trained_agent,
+    with_shaking_pole,
 )
 from cartpole_rl.workflows.config import ExportConfig
 
@@ -84,8 +85,7 @@ def write_rig(config: ExportConfig, folder: Path, words: Sequence[str]) -> None:
     given = [word for word in words if word.startswith(chosen)]
     source = " ".join(given if config.cart else ["cart=ip02", *given])
     cart = config.cart or choice("cart/ip02")
-    numbers = completed({**cart, **pole.heaviest_on(cart["cart_mass"]).model_dump()})
-    header = rig_header(hardware_of(cart), source, lever_um(numbers))
+    header = rig_header(hardware_of(cart), source, lever_um(completed(with_shaking_pole(cart, pole))))
     write_config(folder, "export", {**config.model_dump(mode="json"), "seed": None})
     write_text(folder / RIG_HEADER, header)
     print(f"{folder}/{RIG_HEADER} is written; build the firmware with RIG={(folder / RIG_HEADER).resolve()}")

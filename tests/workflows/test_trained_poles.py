@@ -2,8 +2,9 @@
 
 import pytest
 
-from cartpole_rl.choices import group_choices
+from cartpole_rl.choices import choice, group_choices
 from cartpole_rl.randomization.poles import Pole, PoleSettings, one_pole, pole_of_length
+from cartpole_rl.workflows.build import with_shaking_pole
 from cartpole_rl.workflows.poles import emulated_words, other_pole
 
 POLES = group_choices("pole")
@@ -54,3 +55,14 @@ def test_a_stated_length_is_that_of_a_trained_pole_or_of_a_shipped_one_or_of_a_r
     assert pole_of_length(0.63, similar).name == "0.64 m"
     line = "warning: the agent was trained with a pole of 0.36 m, the cart has one of 0.50 m"
     assert other_pole([MEDIUM], pole_of_length(0.5, MEDIUM), emulated=False) == line
+
+
+def test_the_pole_that_shakes_a_cart_most_has_the_longest_lever() -> None:
+    """Not the largest mass times length: a heavy pole moves the common centre of mass less far."""
+    poles = {"short": (0.3, 0.12), "long": (0.1, 0.3)}
+    choices = {
+        name: {"pole_mass": mass, "pole_com": com, "pole_inertia": 1e-3}
+        for name, (mass, com) in poles.items()
+    }
+    numbers = with_shaking_pole(choice("cart/laboratorio"), PoleSettings(choices=choices))
+    assert (numbers["pole_mass"], numbers["pole_com"]) == poles["long"]

@@ -27,7 +27,7 @@ from cartpole_rl.emulator.guards import FASTEST_CART, FASTEST_POLE, LONGEST_US, 
 from cartpole_rl.emulator.homing import Homing, HomingError, Reading, Window, Zeros, find_hanging
 from cartpole_rl.emulator.link import Channel
 from cartpole_rl.errors import CartPoleError, ConfigError, LinkError, reason_of
-from cartpole_rl.plants.drivers.driver import CLOCK_WRAP, Driver, Measurement
+from cartpole_rl.plants.drivers.driver import Driver, Measurement, unwrapped
 from cartpole_rl.plants.drivers.potentiometer import Potentiometer
 from cartpole_rl.plants.settings import BoardSettings
 from cartpole_rl.rig.hardware import Hardware
@@ -50,7 +50,7 @@ SILENT_PERIODS = 3  # control periods without a measurement, after which the mot
 STOPS = 3  # lines that stop a board; the first may be damaged
 STOPPING = 2.0  # s that a cart which does not stop at the value 0 is given to stop
 STANDS = 1e-3  # m/s, of a cart whose speed is known from what was sent alone
-LARGEST_CREEP = 0.02  # m/s, that a coarse count shows of a cart that stands
+LARGEST_CREEP = 0.02  # m/s: more is no flicker of the count of a cart that stands
 STANDS_US, STANDS_COUNTS = 500_000, 1  # a measured cart stands if its count stays so near one for this time
 SETTLING = 0.1  # s: how fast such a cart is braked
 EARLY_US = 50_000  # a time stamp that lies so far after the arrival is damaged
@@ -528,9 +528,8 @@ class Bridge:
         return self._accept(new, pole, now_us)
 
     def _unwrapped(self, us: int) -> int:
-        """Return the board's time without the wrap of a 32-bit counter."""
-        last = self._last.us if self._last is not None and self._last.us is not None else us
-        return last + (us - last + CLOCK_WRAP // 2) % CLOCK_WRAP - CLOCK_WRAP // 2
+        last = us if self._last is None or self._last.us is None else self._last.us
+        return unwrapped(us, last)
 
     def _fits(self, last: Measurement, new: Measurement, arrived: int, refused: int = 0) -> bool:
         """Return True if a cart can move from one measurement to the other; `arrived` us lie between at most.

@@ -18,6 +18,11 @@ if TYPE_CHECKING:
 CLOCK_WRAP = 2**32  # of micros() and millis()
 
 
+def unwrapped(ticks: int, last: int) -> int:
+    """Return the ticks of a clock of 32 bits without its wrap: those nearest to the `last` ones."""
+    return last + (ticks - last + CLOCK_WRAP // 2) % CLOCK_WRAP - CLOCK_WRAP // 2
+
+
 class Measurement(NamedTuple):
     """One measurement of a board. Counts grow to the right, from any zero."""
 

@@ -14,7 +14,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from cartpole_rl.errors import LinkError
-from cartpole_rl.plants.drivers.driver import CLOCK_WRAP, Driver, Measurement
+from cartpole_rl.plants.drivers.driver import CLOCK_WRAP, Driver, Measurement, unwrapped
 from cartpole_rl.plants.serial.port import open_port, resolved_port, set_exclusive
 from cartpole_rl.rig.hardware import Encoders
 
@@ -49,7 +49,7 @@ class TextDriver(Driver):
         self._dropping = False  # until the next line: this one is too long
         self._queued_since: float | None = None  # when lines began to wait in the system's buffer
         self._cut = False  # the last line was perhaps sent in part
-        self._clock: tuple[int, int] | None = None  # the newest time in the board's unit, and unwrapped in us
+        self._ticks: int | None = None  # the newest time in the board's unit, unwrapped
         self.port = settings.port
 
     def open(self) -> None:
@@ -175,10 +175,8 @@ class TextDriver(Driver):
         if "." in word:
             raise ValueError(f"time has decimals, which plant.time_unit={self.settings.time_unit} has not")
         ticks = int(matching(WHOLE, word))
-        last, us = self._clock or (ticks, ticks * unit)
-        passed = (ticks - last + CLOCK_WRAP // 2) % CLOCK_WRAP - CLOCK_WRAP // 2
-        self._clock = ticks, us + passed * unit
-        return self._clock[1]
+        self._ticks = ticks if self._ticks is None else unwrapped(ticks, self._ticks)
+        return self._ticks * unit
 
     def _number(self, word: str, column: str) -> float:
         """Return the number of a column. Raises ValueError."""
