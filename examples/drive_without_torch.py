@@ -84,6 +84,7 @@ def drive_armed(cart, agent, layers, pole_length, seconds):
         if last and (Flags.SOFT_LIMIT in cart.flags or not cart.took_motor(state)):
             history[0]["motor"] = state.motor_applied  # the cart replaced or lost what was sent
         dt = seconds_between(last.time_us, state.time_us) if last else agent.control_period
+        cart.check_suspension(dt)
         cart_step = state.cart_counts - last.cart_counts if last else 0
         pole_step = state.pole_counts - last.pole_counts if last else 0
         theta = ((state.pole_counts + turn // 2) % turn - turn // 2) * 2 * math.pi / turn

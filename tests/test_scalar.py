@@ -73,7 +73,15 @@ def test_shapes_are_followed() -> None:
         first, second = table.unbind(0)
         newest = torch.cat((row, table))[: len(table)]
         parts = table.split([1, 1, 0])
-        return newest, torch.stack((second, first)), parts[1], parts[2], table[0] + row[0, 1:].unsqueeze(0)
+        halves = (*table.chunk(2), row[:, ::2])
+        return (
+            newest,
+            torch.stack((second, first)),
+            parts[1],
+            parts[2],
+            table[0] + row[0, 1:].unsqueeze(0),
+            *halves,
+        )
 
     given = torch.arange(4.0).reshape(2, 2), torch.tensor([[math.nan, -math.inf]])
     result, expected = Scalar(function, given)(tuple(map(plain, given))), function(given)
@@ -87,9 +95,18 @@ def test_one_tensor_may_be_the_example_of_two() -> None:
     assert scalar(((5.0,), (3.0,))) == ((2.0,),)
 
 
-def test_an_unknown_operation_is_named() -> None:
-    with pytest.raises(NotImplementedError, match=r"aten\.erf\.default"):
-        Scalar(lambda values: (values[0].erf(),), (torch.zeros(1),))
+@pytest.mark.parametrize(
+    ("function", "name"),
+    [
+        (lambda values: (values[0].erf(),), "erf"),
+        (lambda values: (values[0].to(torch.uint8),), "_to_copy"),  # wraps
+        (lambda values: (values[0].half(),), "_to_copy"),  # rounds
+        (lambda values: values[0].sort()[:1], "sort"),
+    ],
+)
+def test_an_unknown_operation_is_named(function: Callable[..., tuple[Tensor, ...]], name: str) -> None:
+    with pytest.raises(NotImplementedError, match=rf"aten\.{name}\.default"):
+        Scalar(function, (torch.zeros(1),))
 
 
 def test_a_call_with_other_shapes_is_refused() -> None:

@@ -154,10 +154,18 @@ def decode(observation: Tensor, kind: ObservationKind) -> tuple[State, Tensor]:
 
 
 def regulator(table: Tensor, models: Models, period: float) -> Array:
-    """Return the gain [4], N per m, m/s, rad and rad/s, for the cart `table` [P, 1] float64."""
+    """Return the gain [4], N per m, m/s, rad and rad/s, for the cart `table` [P, 1] float64.
+
+    Raises ConfigError for a cart that no gain balances.
+    """
     transition, effect = linearized(table, models, period)
     state_cost, force_cost = np.diag(STATE_COST), np.array([[FORCE_COST]])
-    cost_to_go = solve_discrete_are(transition, effect, state_cost, force_cost)
+    try:
+        cost_to_go = solve_discrete_are(transition, effect, state_cost, force_cost)
+    except (ValueError, np.linalg.LinAlgError):
+        raise ConfigError(
+            "run=lqr: no regulator balances this cart; check the masses and frictions of cart and pole"
+        ) from None
     gain = np.linalg.solve(force_cost + effect.T @ cost_to_go @ effect, effect.T @ cost_to_go @ transition)
     return gain[0]
 

@@ -25,6 +25,7 @@ from cartpole_rl.plants.specs import tensordict_of
 from cartpole_rl.registry import object_at
 
 METADATA = "cartpole_rl"  # in an ONNX file of cartpole-export: agent.json
+UNSIGNED = torch.uint16, torch.uint32, torch.uint64  # PyTorch compares none of them
 CHOSEN_BY = {  # what an exported agent has, and the setting that chooses it
     "motors": "choose them by actions=",
     "control_period": "choose it by control_period=",
@@ -65,6 +66,10 @@ class OwnPolicy:
     def _result(self, observation: Tensor) -> Tensor:
         try:
             given = torch.as_tensor(self._function(observation.clone()))
+            if given.dtype in UNSIGNED:
+                given = given.long()
+            elif given.is_floating_point() and given.itemsize == 1:
+                given = given.float()
         except Exception as error:
             last = traceback.extract_tb(error.__traceback__)[-1]
             why = f"{type(error).__name__}: {' '.join(str(error).split())}"
@@ -130,9 +135,16 @@ def onnx_function(file: Path, expected: Mapping[str, Any]) -> Callable[[Tensor],
         session = onnxruntime.InferenceSession(file, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # its errors have no common class
         raise ConfigError(f"it is no ONNX model: {' '.join(str(error).split())}") from None
-    about = json.loads(session.get_modelmeta().custom_metadata_map.get(METADATA, "{}"))
-    for name, wanted in expected.items():
-        for known, other in differences(about.get(name, wanted), wanted):
-            raise ConfigError(f"it was exported with {name} {known}, not {other}; {CHOSEN_BY[name]}")
+    try:
+        about = json.loads(session.get_modelmeta().custom_metadata_map.get(METADATA, "{}"))
+        others = [
+            (name, *each)
+            for name, wanted in expected.items()
+            for each in differences(about.get(name, wanted), wanted)
+        ]
+    except (ValueError, AttributeError):
+        raise ConfigError(f"its entry {METADATA} is damaged; export the agent again") from None
+    for name, known, other in others[:1]:
+        raise ConfigError(f"it was exported with {name} {known}, not {other}; {CHOSEN_BY[name]}")
     name, output = session.get_inputs()[0].name, session.get_outputs()[0].name
     return lambda observation: session.run([output], {name: observation.numpy()})[0]

@@ -23,7 +23,13 @@ EXACT = {  # on integers, alike in all languages
     "square": "{0} * {0}",
     "sub": "{0} - {1}",
 }
-LOGICAL = {"bitwise_and": "{0} && {1}", "bitwise_or": "{0} || {1}", "logical_not": "!{0}"}  # on booleans
+LOGICAL = {  # on booleans
+    "add": "{0} || {1}",
+    "bitwise_and": "{0} && {1}",
+    "bitwise_or": "{0} || {1}",
+    "logical_not": "!{0}",
+    "mul": "{0} && {1}",
+}
 OPERATIONS: dict[str, tuple[str, ...]] = {  # in Python, in JavaScript and, if C has it, on floats in C
     "abs": ("abs({0})", "Math.abs({0})", "fabsf({0})"),
     "clamp": ("clamped({0}, {1}, {2})", "clamped({0}, {1}, {2})", "clamped({0}, {1}, {2})"),
@@ -68,7 +74,8 @@ class Python:
     """Python, and what all languages share. The expressions call FUNCTIONS."""
 
     column = 0  # of OPERATIONS
-    logical: Mapping[str, str] = {}  # expressions on booleans that are others than on integers
+    # expressions on booleans that are others than on integers
+    logical: Mapping[str, str] = {"add": "{0} or {1}", "mul": "{0} and {1}"}
 
     def __init__(self) -> None:
         place = self.column

@@ -24,6 +24,7 @@ from cartpole_rl.arithmetic.languages import FUNCTIONS, PYTHON, Line, Operand, P
 
 Expressions = NDArray[np.object_]  # numbers, and names of variables
 LARGEST_FLOAT = torch.finfo(torch.float32).max
+CONVERTED = None, torch.bool, torch.int32, torch.int64, torch.float32, torch.float64  # others round or wrap
 CONVERSIONS = {bool: "to_bool", float: "to_float", int: "to_int"}
 FILLED = {"new_ones": 1, "new_zeros": 0, "ones_like": 1, "zeros_like": 0}
 MOST_OPERANDS = {"clamp": 3, "nan_to_num": 4, "where": 3}
@@ -84,10 +85,12 @@ class Writer:
         if name in SHAPES:
             return SHAPES[name](*arguments, **named)
         example = node.meta["val"]
-        kind = kind_of(example.dtype)
-        if name in FILLED:
-            return np.full(tuple(example.shape), kind(FILLED[name]), dtype=object)
         try:
+            if not isinstance(example, torch.Tensor):  # several results
+                raise KeyError(name)
+            kind = kind_of(example.dtype)
+            if name in FILLED:
+                return np.full(tuple(example.shape), kind(FILLED[name]), dtype=object)
             return self._each(*operation_of(name, arguments, named, kind), kind)
         except KeyError:
             raise NotImplementedError(
@@ -123,6 +126,8 @@ def operation_of(
     Raises KeyError if it has an option that is not known here, such as alpha.
     """
     if name == "_to_copy":
+        if named.get("dtype") not in CONVERTED:
+            raise KeyError(name)
         return CONVERSIONS[kind], arguments
     if named:
         raise KeyError(name)
@@ -161,9 +166,10 @@ SHAPES: dict[str, Callable[..., Any]] = {
     "cat": lambda parts, dim=0: np.concatenate(parts, dim),
     "clone": placed,
     "select": lambda values, dim, place: placed(np.take(values, place, dim)),
-    "slice": lambda values, dim=0, start=None, end=None: np.take(
-        values, range(*slice(start, end).indices(values.shape[dim])), dim
+    "slice": lambda values, dim=0, start=None, end=None, step=1: np.take(
+        values, range(*slice(start, end, step).indices(values.shape[dim])), dim
     ),
+    "split": lambda values, size, dim=0: np.split(values, range(size, values.shape[dim], size), dim),
     "split_with_sizes": lambda values, sizes, dim=0: np.split(values, np.cumsum(sizes)[:-1], dim),
     "stack": lambda parts, dim=0: np.stack(parts, dim),
     "unbind": lambda values, dim=0: [placed(np.take(values, each, dim)) for each in range(values.shape[dim])],

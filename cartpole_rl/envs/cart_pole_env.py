@@ -7,14 +7,16 @@ same way (tests/envs/test_one_cart.py).
 
 from collections.abc import Callable
 from functools import cached_property
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs import Compose, TransformedEnv
+from torchrl.envs import Compose, EnvBase, FrameSkipTransform, TransformedEnv
 
 from cartpole_rl.envs.hardware import HardwareTransform
 from cartpole_rl.envs.perception import Percept, Previous
+from cartpole_rl.errors import ConfigError
 from cartpole_rl.plants.specs import Numbers, Plant, PlantOutput, tensordict_of
 from cartpole_rl.scalar import Scalar, plain
 from cartpole_rl.tasks.settings import NO_ACTION
@@ -131,9 +133,17 @@ class CartPoleEnv(TransformedEnv):
         """The same environment on plain numbers, for a plant of one cart. Raises ConfigError."""
         return OneCart(self.plant, self.hardware)
 
+    def append_transform(self, transform: Any, *arguments: Any, **named: Any) -> EnvBase:
+        """Append a transform. Raises ConfigError for one that steps several times on the same counts."""
+        return super().append_transform(checked(transform), *arguments, **named)
+
+    def insert_transform(self, index: int, transform: Any) -> EnvBase:
+        """Insert a transform. Raises ConfigError as `append_transform`."""
+        return super().insert_transform(index, checked(transform))
+
     def step(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Step all carts; return `tensordict` with the outcome under "next". Nothing is checked."""
-        if not self._stands_alone:
+        if not self._stands_alone or "_step" in tensordict:  # TorchRL's mask of the carts to step
             return super().step(tensordict)
         return tensordict.set("next", self._driven(tensordict))
 
@@ -170,6 +180,13 @@ class CartPoleEnv(TransformedEnv):
         """Return the outcome of a step of the plant under the hardware transform alone."""
         command = self.hardware.command(tensordict)
         return self.hardware.perceive(tensordict, command, self.plant._step(command))
+
+
+def checked(transform: Any) -> Any:
+    """Return a transform. Raises ConfigError for a frame skip: it would measure n times the velocities."""
+    if isinstance(transform, FrameSkipTransform):
+        raise ConfigError("FrameSkipTransform measures several periods as one; give a longer control_period")
+    return transform
 
 
 def replaced(values: Tensor, rows: Tensor, new: Tensor) -> Tensor:

@@ -217,6 +217,20 @@ class ExportedAgent:
             digest.update(np.ascontiguousarray(values, FLOATS).tobytes())
         return digest.hexdigest()
 
+    def values(self, observations: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the action values [N, A] of observations [N, K]."""
+        about, h = self.description, observations
+        for number, layer in enumerate(self.layers):
+            h = h @ layer.weight.T.astype(np.float64) + layer.bias
+            if layer.gain is not None:
+                parts = h.reshape(len(h), about.norm_groups, -1)
+                parts = parts - parts.mean(2, keepdims=True)
+                parts = parts / np.sqrt((parts**2).mean(2, keepdims=True) + about.norm_epsilon)
+                h = layer.gain * parts.reshape(len(h), -1) + layer.shift
+            if number < len(self.layers) - 1:
+                h = np.maximum(h, 0)
+        return h
+
     def check(self, source: str) -> None:
         """Raise CheckpointError, which names `source`, if the parts do not fit or a weight is not finite."""
         if not self.description.is_consistent:

@@ -7,6 +7,7 @@ from functools import reduce
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 import yaml
 
@@ -25,6 +26,7 @@ from cartpole_rl.learning.agent import QAgent
 from cartpole_rl.learning.checkpoints import AgentCheckpoint, load_agent, restore_weights
 from cartpole_rl.plants.serial.preparation import Confirm, StartPosition, nobody
 from cartpole_rl.plants.settings import PlantSettings
+from cartpole_rl.plants.specs import tensordict_of
 from cartpole_rl.randomization.poles import Pole, PoleSettings, check_one_pole
 from cartpole_rl.rig.hardware import Hardware, hardware_of
 from cartpole_rl.rig.parameters import check_names, completed
@@ -155,7 +157,24 @@ def exported_agent(trained: TrainedAgent, origin: Mapping[str, Any]) -> Exported
     about = description(compiled_training(trained), trained.training.agent, origin)
     agent = ExportedAgent(about, tuple(Layer(*each) for each in network_of(trained).plain_layers()))
     agent.check("run")
+    check_plain_layers(agent, trained)
     return agent
+
+
+@torch.no_grad()
+def check_plain_layers(agent: ExportedAgent, trained: TrainedAgent) -> None:
+    """Raise ConfigError if the plain layers choose otherwise than the policy, as with another activation."""
+    observation = torch.randn(256, agent.description.sizes[0], generator=torch.Generator().manual_seed(0))
+    chosen = trained.policy(tensordict_of({"observation": observation}))
+    values, found = chosen["action_value"].double().numpy(), agent.values(observation.double().numpy())
+    tolerance = 1e-3 * (1 + np.abs(values).max())
+    best = np.take_along_axis(values, chosen["action"].numpy()[:, None], 1)[:, 0]
+    if not (np.abs(found - values) <= tolerance).all() or not (values.max(1) - best <= tolerance).all():
+        about = trained.training.agent
+        raise ConfigError(
+            f"run: an agent with agent.kind={about.kind} and agent.network={about.network} cannot be "
+            "exported: its `plain_layers` give other action values than its policy"
+        )
 
 
 def network_of(trained: TrainedAgent) -> Any:

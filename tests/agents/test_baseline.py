@@ -121,6 +121,11 @@ def test_it_swings_up_and_balances_the_emulated_cart(
     assert episode.score.sum() > score
 
 
+def test_a_cart_that_no_gain_balances_is_an_error(ip02: dict[str, float]) -> None:
+    with pytest.raises(ConfigError, match="run=lqr: no regulator balances this cart; check the masses"):
+        baseline({**ip02, "cart_viscous": 1e6}, "medium")
+
+
 @pytest.mark.parametrize(
     "changes", [{"kind": ObservationKind.POSITIONS}, {"past_motors": 0}], ids=["positions", "no motors"]
 )

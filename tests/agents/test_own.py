@@ -33,6 +33,12 @@ def mask(observation):
 def complex_values(observation):
     return torch.zeros(2, 3, dtype=torch.complex64)
 
+def unsigned(observation):
+    return observation.argmax(-1).to(torch.uint16)
+
+def of_8_bits(observation):
+    return torch.nn.functional.pad(observation, (0, 1)).to(torch.float8_e5m2)
+
 def as_list(observation):
     return [int(row[1] > row[0]) for row in observation]
 
@@ -74,7 +80,9 @@ def chosen(run: str) -> list[int]:
         return choose(OwnPolicy(Path(run), MOTORS), TensorDict({"observation": observation}, [2])).tolist()
 
 
-@pytest.mark.parametrize("name", ["network", "of_tensordict", "largest", "as_list", "mask"])
+@pytest.mark.parametrize(
+    "name", ["network", "of_tensordict", "largest", "as_list", "mask", "unsigned", "of_8_bits"]
+)
 def test_it_chooses_from_values_or_gives_the_action(name: str) -> None:
     assert chosen(f"own_policies:{name}") == [0, 1]
 
@@ -91,7 +99,7 @@ def test_what_is_not_finite_is_motor_value_0(name: str) -> None:
         ("half", "it chose 0.5; give integers from 0 to 2"),
         ("flat", r"shape \[5\] for observations \[2, 2\]; give actions \[2\] or action values \[2, 3\]"),
         ("complex_values", "it gave complex numbers; give real ones"),
-        ("fails", r"RuntimeError: no weights \(.*own_policies.py, line 3\d\)"),
+        ("fails", r"RuntimeError: no weights \(.*own_policies.py, line [34]\d\)"),
         ("Driver", "it is a class; give a function"),
         ("none", "has no 'none'"),
     ],
@@ -115,6 +123,13 @@ def test_an_onnx_file_drives_with_its_own_motor_values(monkeypatch: pytest.Monke
     onnx.save(model, "own.onnx")
     with pytest.raises(ConfigError, match=r"motors \[-200, 200\], not \[-255, 255\]; choose them by"):
         chosen("own.onnx")
+    for damaged in ("no JSON", "[1]", '{"motors": null, "hardware": null}'):
+        onnx.helper.set_model_props(model, {"cartpole_rl": damaged})
+        onnx.save(model, "own.onnx")
+        with pytest.raises(
+            ConfigError, match=r"^run=own\.onnx: its entry cartpole_rl is damaged; export the"
+        ):
+            OwnPolicy(Path("own.onnx"), MOTORS, {"hardware": {"track_span": 0.8}})
     about = {"control_period": 0.02, "hardware": {"track_span": 0.8, "moving_mass": 1.0}}
     onnx.helper.set_model_props(model, {"cartpole_rl": json.dumps(about)})
     onnx.save(model, "own.onnx")

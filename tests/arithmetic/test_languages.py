@@ -20,7 +20,7 @@ from cartpole_rl.arithmetic.writer import Writer
 from cartpole_rl.exporting.code import Graph, filled
 from cartpole_rl.exporting.web_page import function
 
-NOT_IN_C = {5, 14, 24, 25}  # remainders, and conversions of infinite numbers to integers
+NOT_IN_C = {5, 14, 25, 26}  # remainders, and conversions of infinite numbers to integers
 
 
 class Pair(NamedTuple):

@@ -4,10 +4,11 @@ from collections.abc import Callable
 
 import pytest
 from courses import course
-from torchrl.envs import CatFrames, InitTracker, RewardSum, Transform, TransformedEnv
+from torchrl.envs import CatFrames, FrameSkipTransform, InitTracker, RewardSum, Transform, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
+from cartpole_rl.errors import ConfigError
 
 TRANSFORMS: dict[str, Callable[[], Transform]] = {
     "RewardSum": RewardSum,
@@ -33,3 +34,10 @@ def test_an_appended_transform_gives_what_a_nested_environment_gives(
         for mine, other in zip(ours, theirs, strict=True):
             assert {*mine.keys(True, True)} == {*other.keys(True, True)}
             assert (mine == other).all()
+
+
+def test_a_frame_skip_is_refused(simulated: Callable[..., CartPoleEnv]) -> None:
+    env = simulated(4)
+    for add in (env.append_transform, lambda transform: env.insert_transform(0, transform)):
+        with pytest.raises(ConfigError, match="give a longer control_period"):
+            add(FrameSkipTransform(3))

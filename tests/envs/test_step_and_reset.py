@@ -68,6 +68,15 @@ def test_equals_torchrls_step(environments: tuple[CartPoleEnv, TransformedEnv]) 
         assert any(0 < count < CARTS for count in rows)
 
 
+def test_a_skipped_step_moves_no_cart(environments: tuple[CartPoleEnv, TransformedEnv]) -> None:
+    """`_step` is TorchRL's mask."""
+    for env in environments:
+        present = env.reset().set("action", torch.ones(CARTS, dtype=torch.int64))
+        before = env.base_env.true_state.x.clone()
+        env.step(present.set("_step", torch.zeros(CARTS, dtype=torch.bool)))
+        assert torch.equal(env.base_env.true_state.x, before)
+
+
 def test_keeps_the_keys_that_a_policy_wrote(environments: tuple[CartPoleEnv, TransformedEnv]) -> None:
     env = environments[0]
     present = env.reset().set("action", torch.ones(CARTS, dtype=torch.int64))

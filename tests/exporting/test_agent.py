@@ -16,6 +16,8 @@ import numpy as np
 import pytest
 import torch
 from parity import assert_same_actions
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from torch import nn
 
 from cartpole_rl.agents.network import FrameReader, MirrorQNetwork, QNetwork
 from cartpole_rl.envs.build import simulated_env
@@ -28,8 +30,9 @@ from cartpole_rl.exporting.agent import (
     observed_numbers,
     read_agent,
 )
+from cartpole_rl.learning.agent import QAgent
 from cartpole_rl.tasks.features import Quantity
-from cartpole_rl.workflows.build import TrainedAgent, exported_agent, network_of, provenance
+from cartpole_rl.workflows.build import TrainedAgent, exported_agent, network_of, new_agent, provenance
 from cartpole_rl.workflows.config import TrainConfig, load_settings
 from examples.drive_without_torch import action_values
 
@@ -92,6 +95,36 @@ def test_plain_layers_are_the_network(
 def test_a_recurrent_network_is_refused() -> None:
     with pytest.raises(ConfigError, match="a recurrent agent"):
         QNetwork(4, 5, [8], True, FrameReader(4, [[0, 1], [2, 3]], 8)).plain_layers()
+
+
+def smooth(agent: QAgent) -> TensorDictModuleBase:
+    """With another activation than the plain layers have."""
+    policy: Any = agent.greedy_policy()
+    layers = policy.module[0].module.layers
+    for place, module in enumerate(layers):
+        layers[place] = nn.SiLU() if isinstance(module, nn.ReLU) else module
+    return policy
+
+
+def weak(agent: QAgent) -> TensorDictModuleBase:
+    """Without full motor to the left."""
+
+    def masked(value: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        value = value.index_fill(-1, torch.tensor(0), -1e3)
+        return value, value.argmax(-1)
+
+    keys = ["action_value", "action"]
+    return TensorDictSequential(*agent.greedy_policy().module, TensorDictModule(masked, keys[:1], keys))
+
+
+@pytest.mark.parametrize("changed", [smooth, weak])
+def test_layers_that_are_not_the_policy_are_refused(
+    changed: Callable[[QAgent], TensorDictModuleBase],
+) -> None:
+    training = load_settings(TrainConfig, {"agent.hidden": [16], "agent.mirrored": False, "guard": "none"})
+    policy = changed(new_agent(training))
+    with pytest.raises(ConfigError, match="its `plain_layers` give other action values than its policy"):
+        exported_agent(TrainedAgent(training, policy), {})
 
 
 def test_the_medium_agent_acts_as_in_pytorch(

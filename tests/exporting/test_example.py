@@ -12,11 +12,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from serial_peer import CartPeer
 
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.exporting.agent import ExportedAgent, observed_numbers
 from cartpole_rl.plants.emulated import EmulatedCart
 from cartpole_rl.tasks.settings import Start
+from cartpole_rl.wire.messages import Flags, SetMotor
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples/drive_without_torch.py"
@@ -124,6 +126,25 @@ def test_an_agent_that_needs_an_upright_pole_is_refused(exported: ExportedAgent,
     about = exported.description.model_copy(update={"start": Start.UPRIGHT, "angle_limit": 0.2})
     file = written(replace(exported, description=about), tmp_path)
     check_refused("needs an upright pole", file, tmp_path / "port")
+
+
+def test_a_gap_on_the_carts_clock_ends_the_drive(file: Path) -> None:
+    class Suspended(CartPeer):
+        armed = 0
+
+        def next_state(self, **changes: int) -> bytes:
+            self.armed += Flags.ARMED in self.flags
+            if self.armed == 50:
+                self.before = len(self.received)
+                changes["time_us"] = self.state.time_us + 1_500_000
+            return super().next_state(**changes)
+
+    with Suspended() as cart:
+        code, _, err = ended(started(file, cart.port))
+        assert code == 1
+        assert "did not answer the cart" in err
+        sent = [frame.message for frame in cart.received[cart.before :]]
+        assert not any(message.motor for message in sent if isinstance(message, SetMotor))
 
 
 def test_a_fallen_pole_ends_the_drive(exported: ExportedAgent, tmp_path: Path) -> None:

@@ -33,6 +33,7 @@ OPERATIONS: tuple[Callable[[Tensor, Tensor], Tensor], ...] = (
     lambda a, b: torch.where((a > b) | (a == 0), a, b),
     lambda a, b: ~(a <= b) & (b != 0),
     lambda a, b: (a < 1.5) * b,
+    lambda a, b: ((a > 0) + (b > 0)) * (a < b),
     lambda a, b: 1 * (a >= b) - 1 * (a < b),
     lambda a, b: (a > 0).to(a.dtype) + b.bool(),
     lambda a, b: (a.nan_to_num(0.0).clamp(-5000, 5000).long() + 2048) & 4095,

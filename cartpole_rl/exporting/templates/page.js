@@ -44,6 +44,7 @@ function record(dt) {
 }
 
 function restart() {
+  if (real && !real.done) return; // its port is still open
   real = null;
   cart = simulated;
   cart.reset({ ...REST, theta: REST.theta + 0.02 * (Math.random() - 0.5), x: 0.1 * (Math.random() - 0.5) });
