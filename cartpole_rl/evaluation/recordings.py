@@ -6,6 +6,7 @@ simulated cart and its initial state are stored as in metrics.json.
 """
 
 import csv
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -49,12 +50,15 @@ class Recording(NamedTuple):
     def pole_length(self) -> float | None:
         """The pole's length (m) in the heading; None where it has none. Raises RecordingError."""
         text = self.facts.get(LENGTH)
+        if not text:
+            return None
         try:
-            return float(text) if text else None
+            length = float(text)
         except ValueError:
-            raise RecordingError(
-                f"recording {self.name} is damaged: {LENGTH} is {text!r}, and not a number"
-            ) from None
+            length = math.nan
+        if not 0 < length < math.inf:
+            raise RecordingError(f"recording {self.name} is damaged: {LENGTH} is {text!r}, and not a length")
+        return length
 
 
 def write_recording(path: Path, episode: Episode, facts: Mapping[str, Any] | None = None) -> None:

@@ -25,6 +25,7 @@ LEAST_TRAVEL, LEAST_SWING = 0.05, 0.35  # m, rad
 LEAST_OF_EACH = 0.01, 0.05  # m, rad, in each recording: less than any experiment's
 STILL, STILL_ANGLE, STILL_SPREAD = 0.3, 0.2, 0.02  # s, rad from hanging, rad
 BALANCED, BALANCED_ANGLE, BALANCED_MEAN = 5.0, 0.35, 0.1  # s; rad from upright, of the angle and of its mean
+PASSING = 0.3  # rad from upright
 FLICKER = 0.01  # rad to both sides of its mean: a pole that lies on a stop does not move
 FROZEN = 1.0  # s
 ZERO_INTERVAL = 0.02  # rad, 95 % of the zero that motion tells
@@ -151,8 +152,19 @@ def zero_is_known(episodes: Sequence[Episode], period: float, on_step: Callable[
 
 
 def motions(episodes: Sequence[Episode]) -> list[Motion]:
-    """Return the motion in each episode."""
-    return [Motion(each.x, each.theta, each.motor.astype(float)) for each in episodes]
+    """Return the motion in each episode, upright at 0 where its pole passes upright."""
+    return [Motion(each.x, about_upright(each.theta), each.motor.astype(float)) for each in episodes]
+
+
+def about_upright(theta: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return angles, rad, less whole turns: the one nearest to upright is near 0.
+
+    A log that begins beyond a whole turn has its upright there. With a wrong scale, that is not 0.
+    """
+    beside = np.abs(wrap(theta))
+    nearest = int(beside.argmin())
+    turns = np.round(theta[nearest] / (2 * np.pi)) if beside[nearest] < PASSING else 0.0
+    return theta - 2 * np.pi * turns
 
 
 def shows_motion(episode: Episode) -> bool:

@@ -30,10 +30,14 @@ METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 TURN = {"rad": 2 * np.pi, "deg": 360.0, "turn": 1.0}
 FASTEST = 5.0  # m/s: no cart is faster
 LEAP, SMALL_LEAP = 0.25, 0.05  # turns beside whole ones between two rows; the latter where it is over a turn
+FEW, LEAST_JUMPS = 50, 3  # values of a column that does not turn; jumps that tell where it wraps
+MOST_OF_RANGE, ALIKE = 0.8, 0.02  # shares of a column's range, and of a jump by which others may differ
 TURNING, STALE = 0.05 / (2 * np.pi), 1 / 3  # turns in three rows; share of such rows that repeat their states
 MOST_COUNTS = 2**31 - 1  # of an encoder, as in recordings
 NUMBERS = re.compile(r"(?=.*\d)([-+.,;:|\s\dEe]|nan|inf)+", re.IGNORECASE)  # a row of them
 SLACK = 1e-6  # s, of sums of times
+FINEST = 0.01  # share of the time between rows: with a shorter period a wrong unit would fill the memory
+LONGEST_CELL = 40  # characters in a message
 LONGEST_GAP = 3  # gaps between two rows: rows further apart are missing, also where rows are resampled
 UNKNOWN, TWICE = "with an empty cell or no finite number", "that repeat the row before"
 SHORT, STANDING = "in a part that is too short", "in a part in which motor, cart or pole stand still"
@@ -53,6 +57,7 @@ class Report(NamedTuple):
     beyond: int  # rows with a motor value beyond full
     leaps: int  # rows to which no pole turns from the row before
     leap: str  # the first of them
+    wrap: float  # turns by which the angle jumps where its column wraps; 0 if it does not
     anew: bool  # they are of one size, as where a counter begins anew
     jumps: int  # rows to which the cart would be faster than FASTEST
     stale: float  # share of the rows of a turning pole that have the states of the row before
@@ -66,6 +71,7 @@ class Rows(NamedTuple):
 
     path: Path
     columns: dict[str, Array]  # [T] by name
+    places: NDArray[np.int64]  # [T] in the file, from 1
     time: Array  # [T] s, from 0
     unknown: int  # further rows, with an empty cell or a number that is not finite
     repeated: int  # further rows, the same as the one before
@@ -100,8 +106,9 @@ def read_rows(path: Path, layout: Layout) -> Rows:
     columns = {name: values[fresh] for name, values in columns.items()}
     if fresh.sum() < 2:
         raise NotALogError(f"{path} has fewer than two rows with a number in each of {', '.join(columns)}")
-    time = times(path, stamps[fresh], layout.time)
-    return Rows(path, columns, time, int((~known).sum()), int((~fresh).sum()))
+    places = np.flatnonzero(known)[fresh] + 1
+    time = times(path, stamps[fresh], layout.time, places)
+    return Rows(path, columns, places, time, int((~known).sum()), int((~fresh).sum()))
 
 
 def cut_log(read: Rows, layout: Layout, encoders: Encoders, period: float) -> Log:
@@ -110,6 +117,11 @@ def cut_log(read: Rows, layout: Layout, encoders: Encoders, period: float) -> Lo
     Raises RecordingError, with file and row.
     """
     path, columns, time = read.path, read.columns, read.time
+    if layout.resample and period < FINEST * read.period:
+        raise RecordingError(
+            f"{path}: its rows are {1e3 * read.period:g} ms apart, far more than a period of "
+            f"{1e3 * period:g} ms: mend layout.time.unit or layout.period"
+        )
     gaps = np.diff(time)
     jitter = float(np.quantile(np.abs(gaps - period), 0.95)) if len(gaps) else 0.0
     x = signed(layout.position.positive) * (columns[layout.position.name] - layout.position.zero)
@@ -146,7 +158,7 @@ def cut_log(read: Rows, layout: Layout, encoders: Encoders, period: float) -> Lo
             place, column = np.argwhere(beyond)[0]
             name, row = (layout.position.name, layout.angle.name)[column], first + place
             raise RecordingError(
-                f"{path}: {name} is {columns[name][row]:g} in row {row + 1}, which no "
+                f"{path}: {name} is {columns[name][row]:g} in row {read.places[row]}, which no "
                 "encoder counts: correct it, or leave the row out by layout.keep"
             )
         late = int(layout.motor.row == "in_force")
@@ -173,15 +185,33 @@ def cut_log(read: Rows, layout: Layout, encoders: Encoders, period: float) -> Lo
         int((np.abs(motor) >= 0.999).sum()),
         int((np.abs(motor) > 1.001).sum()),
         len(leaps),
-        f"row {leaps[0] + 1} of {path.name}" if len(leaps) else "",
+        f"row {read.places[leaps[0]]} of {path.name}" if len(leaps) else "",
+        wrap_of(theta, together),
         len(leaps) > 0 and float(np.ptp(turned[leaps - 1])) < SMALL_LEAP,
-        int((np.abs(np.diff(x)) > FASTEST * gaps).sum()),
+        int((np.abs(np.diff(x)) > FASTEST * np.maximum(gaps, period)).sum()),  # stamps of a host are late
         stale_share(x, theta),
         period,
         read.period,
         jitter,
     )
     return Log(parts, report)
+
+
+def wrap_of(angle: Array, together: NDArray[np.bool_]) -> float:
+    """Return the size of the jumps [T] where a column of angles wraps; 0 for one that does not.
+
+    `together` [T - 1] are steps without a gap. A jump is over most of the column's range, larger than the
+    steps beside it, and as large as the others.
+    """
+    if len(angle) < 4 or len(np.unique(angle)) < FEW:
+        return 0.0
+    step = np.diff(angle)
+    calm = np.maximum(np.abs(step[:-2]), np.abs(step[2:]))
+    size = np.abs(step[1:-1] - (step[:-2] + step[2:]) / 2)
+    at_once = together[:-2] & together[1:-1] & together[2:]
+    jumps = size[at_once & (size > 3 * calm) & (size > MOST_OF_RANGE * np.ptp(angle))]
+    alike = len(jumps) >= LEAST_JUMPS and np.ptp(jumps) < 2 * ALIKE * np.median(jumps)
+    return float(np.median(jumps)) if alike else 0.0
 
 
 def stale_share(x: Array, theta: Array) -> float:
@@ -256,8 +286,11 @@ def check_columns(path: Path, wanted: Sequence[str], present: Sequence[str]) -> 
 
 def read_npz(path: Path) -> Mapping[str, NDArray]:
     """Return the arrays of an .npz file."""
-    with np.load(path) as file:
-        return dict(file)
+    try:
+        with np.load(path) as file:
+            return dict(file)
+    except ValueError:  # NumPy takes it for a pickle
+        raise ValueError("it is damaged, or holds other than arrays of numbers") from None
 
 
 def read_mat(path: Path) -> Mapping[str, NDArray]:
@@ -334,31 +367,38 @@ def _numbers(
     for index, (row, line) in enumerate(zip(rows, lines, strict=True)):
         cell = row[column] if column < len(row) else ""
         try:
+            if "_" in cell or (layout.decimal == "," and "." in cell):  # of thousands
+                raise ValueError
             values[index] = float(cell.replace(layout.decimal, ".") or "nan")
         except ValueError:
+            shown = cell if len(cell) <= LONGEST_CELL else f"{cell[:LONGEST_CELL]}..."
             if NUMBERS.fullmatch(cell) and ":" not in cell:
                 advice = ", or mend decimal= and delimiter= of the layout"
             elif NUMBERS.fullmatch(cell):
                 advice = f" in {layout.time.unit}" if name == layout.time.name else ""
             else:
                 advice = f", leave the cell empty, or begin the line with {layout.comment}"
-            raise RecordingError(f"{path}, line {line}: {name} is {cell!r}; give a number{advice}") from None
+            raise RecordingError(f"{path}, line {line}: {name} is {shown!r}; give a number{advice}") from None
     return values
 
 
-def times(path: Path, values: Array, column: TimeColumn) -> Array:
-    """Return the time of each row in s, from 0, for values that count from a start. Raises RecordingError."""
+def times(path: Path, values: Array, column: TimeColumn, places: NDArray[np.int64]) -> Array:
+    """Return the time of each row in s, from 0, for values that count from a start; `places` are its rows.
+
+    Raises RecordingError.
+    """
     time = (values - values[0]) * SECONDS[column.unit]
     if (back := np.flatnonzero(np.diff(time) <= 0)).size:
         before, after = time[back[0] : back[0] + 2]
+        row, following = places[back[0] : back[0] + 2]
         if before == after:
             raise RecordingError(
-                f"{path}: the time {column.name} is {values[back[0]]:.9g} in rows {back[0] + 1} and "
-                f"{back[0] + 2}; write it with more digits, or leave one of the rows out"
+                f"{path}: the time {column.name} is {values[back[0]]:.9g} in rows {row} and "
+                f"{following}; write it with more digits, or leave one of the rows out"
             )
         raise RecordingError(
-            f"{path}: the time {column.name} goes from {before:.6g} to {after:.6g} s after row "
-            f"{back[0] + 1}; sort the rows, give another column, or cut the log where the clock began anew"
+            f"{path}: the time {column.name} goes from {before:.6g} to {after:.6g} s after row {row}; "
+            "sort the rows, give another column, or cut the log where the clock began anew"
         )
     return time
 

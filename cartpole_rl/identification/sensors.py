@@ -15,6 +15,7 @@ Intervals are 95 % by a bootstrap over recordings, or over pieces of one recordi
 """
 
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -40,8 +41,11 @@ AT_ONCE = (-1.0, -0.5, 0.0, 0.5, 1.0)  # periods, delays at which a motor value 
 LONGEST_DELAY = 0.06  # s; with a short period, more than LATEST
 FINEST = 1e-3  # s between two delays that are tried, or a quarter of a period
 SPEED = 0.05  # m/s from which friction opposes the motion of the cart
-SCALES = (1.0, np.pi / 180, 180 / np.pi)  # of the angle, from which a fit starts
-WIDEST = 0.2, 0.1, 0.5  # interval of an estimate: scale of the angle, its zero in rad, scale of the position
+# of the angle, from which a fit starts: as it was told, half, double, and in other units
+SCALES = (1.0, 0.5, 2.0, np.pi / 180, 180 / np.pi, 2 * np.pi, 0.5 / np.pi)
+# widest intervals: scale of the angle, its zero in rad, scale of the position; a share of over 1
+WIDEST = 0.2, 0.1, 0.5
+FAR_BETTER = 0.5  # share of the unexplained at which another scale is taken for the right one
 OUTLIER = 3.0  # residuals, in median sizes, from which one counts less
 
 
@@ -112,8 +116,14 @@ class Samples:
 
     @property
     def swings(self) -> bool:
-        """True if the pole swings enough to tell its scale."""
-        return max(float(np.ptp(motion.theta)) for motion in self._motions) > SWINGING
+        """True if the pole swings enough to tell its scale, whatever the unit of the angle."""
+        widest = max(float(np.ptp(motion.theta)) for motion in self._motions)
+        return self.unit * widest > SWINGING
+
+    @property
+    def unit(self) -> float:
+        """The one of SCALES at which the equation explains the pole best."""
+        return self._explained[1]
 
     @property
     def falls_upwards(self) -> bool | None:
@@ -124,13 +134,27 @@ class Samples:
         """
         if not self.moves:
             return None
-        fits = []
-        for scale in SCALES:
-            solution, errors = _regression(self.pole_terms(scale), scale * self.theta_ddot, None)
-            fits.append((float(errors.std()) / scale, float(solution[0])))
-        unexplained, gravity = min(fits)
+        unexplained, _, gravity = self._explained
         known = self.swings or unexplained < UNEXPLAINED * float(self.theta_ddot.std())
         return gravity < 0 if known else None
+
+    @cached_property
+    def _explained(self) -> tuple[float, float, float]:
+        """What the equation leaves unexplained at the best scale, the scale, and its gravity.
+
+        The scale is the one that was told, unless another one explains far more.
+        """
+        told, *others = map(self._fit, SCALES)
+        best = min(others)
+        return best if best[0] < FAR_BETTER * told[0] else told
+
+    def _fit(self, scale: float) -> tuple[float, float, float]:
+        solution, errors = _regression(self.pole_terms(scale), scale * self.theta_ddot, None)
+        return float(errors.std()) / scale, scale, float(solution[0])
+
+    def gravity(self, scale: float) -> float:
+        """Return the coefficient of gravity, 1/s^2, at a scale of the angle; negative means upwards."""
+        return self._fit(scale)[2]
 
     def _second_difference(self, values: Array) -> Array:
         return np.convolve(values, (1, -2, 1), "same") / self._period**2
@@ -168,7 +192,7 @@ class Samples:
         """How much a cart that accelerates leaves its pole behind: 1 always, -1 never."""
         if len(self.piece) < LEAST_OF_A_SIGN:
             return 0.0
-        terms = self.pole_terms()
+        terms = self.pole_terms(self.unit)
         return correlation(terms[:, 1], _regression(terms[:, ::2], self.theta_ddot, None)[1])
 
     def push(self, periods: float) -> Array:
@@ -191,9 +215,13 @@ def question_sensors(
     scale = zero = position = delay = None
     if samples.moves and samples.swings:
         found = angle_estimates(samples, dice, on_step)
-        known = (each.high - each.low < widest for each, widest in zip(found, WIDEST, strict=True))
+        known = (
+            each.high - each.low < widest * max(1.0, abs(each.value))
+            for each, widest in zip(found, WIDEST, strict=True)
+        )
         scale, zero, position = (each if sure else None for each, sure in zip(found, known, strict=True))
         scale, position = (each if each and each.low > 0 else None for each in (scale, position))
+        upwards = upwards if scale is None else samples.gravity(scale.value) < 0
         zero = None if upwards else zero
     if samples.moves and samples.push(0).std() > 0:
         delay = delay_estimate(samples, period, dice, on_step)

@@ -129,4 +129,4 @@ def log_files(config: ImportConfig) -> list[Path]:
 
 def logs_in(folder: Path) -> list[Path]:
     """Return the files of a folder that may be logs."""
-    return sorted(path for path in folder.glob("*") if path.suffix.lower() in SUFFIXES)
+    return sorted(path for path in folder.glob("*") if path.suffix.lower() in SUFFIXES and path.is_file())

@@ -20,8 +20,10 @@ from cartpole_rl.evaluation.recordings import LENGTH, write_recording
 from cartpole_rl.identification.checks import motions
 from cartpole_rl.identification.logs import (
     FASTEST,
+    LONGEST_GAP,
     STALE,
     TURN,
+    UNKNOWN,
     Log,
     NotALogError,
     Report,
@@ -43,13 +45,16 @@ ANGLE_SCALE, POSITION_SCALE = 0.01, 0.10  # share by which a scale may differ
 ANGLE_ZERO = 0.02  # rad by which the upright angle may differ
 JITTER = 0.1  # share of the period
 SAME = 0.01  # share by which the period of a log may differ from that of others, or of the layout
-EARLY = 0.25  # periods by which a delay may be estimated too early; a shifted row makes it a whole one
+EARLY = 0.1  # periods by which a delay may be estimated too early; a shifted row makes it a whole one
+WRAP = 0.005  # turns by which a column may wrap beside whole ones
+ALMOST = 0.8  # turns: a column that wraps at less, or at their reciprocal, is in another unit
+UNITS = {"rad": "radians", "deg": "degrees", "turn": "turns"}
 FINER = 0.8  # share of the time between rows: a shorter period of a resampled log is invented
 LATE = 0.05  # s, or two periods: a cart that takes longer is unusual
 RESAMPLED = 5e-4  # s between rows from which a log may be so fast
 LEAPS = 0.02  # share of rows; with a longer period than QUICK a pole may turn so far between two rows
 QUICK = 0.02 * (1 + SAME)  # s
-SATURATED = 0.5  # share of rows
+SATURATED, LACKING = 0.5, 0.25  # shares of rows: with full motor, and with an empty cell
 
 
 def import_logs(config: ImportConfig, folder: Path) -> Sensors | None:
@@ -93,14 +98,15 @@ def import_logs(config: ImportConfig, folder: Path) -> Sensors | None:
     with progress_bar(None, "steps", desc="sensors") as bar:
         taken = parts if SHORTEST_PERIOD <= period <= LONGEST_PERIOD else []  # at 1 kHz it takes minutes
         sensors = question_sensors(motions(taken), period, on_step=bar.update)
-    if angle_leaps(reports, period):  # then it tells nothing, and nor does what is estimated with it
+    # then the angle tells nothing, and nor does what is estimated with it
+    if wrong_wrap(reports, config.layout) or angle_leaps(reports, period):
         sensors = Sensors(None, None, None, None, None, sensors.push, 0.0)
     found = [*doubts(reports, sensors, period, config.layout)]
     write_config(folder, "import", {**config.model_dump(mode="json", by_alias=True), "seed": 0})
-    stems = Counter(path.stem for path in logs)
+    names = Counter(name for path in logs for name in {path.stem, path.name})
     heading = {"plant": "log", "pole": "", LENGTH: config.pole_length or "", "control_period_s": period}
     for path, log in logs.items():
-        name = path.stem if stems[path.stem] == 1 else path.name  # log.csv and log.txt
+        name = path.stem if names[path.stem] == 1 else path.name  # log.csv and log.txt
         for number, part in enumerate(log.parts):
             place = folder / RECORDINGS / f"{name}_{number:02d}.csv"
             write_recording(place, part, {**heading, "log": path.name})
@@ -130,6 +136,11 @@ def nothing_left(reports: Sequence[Report], period: float, config: ImportConfig)
     message = f"from={config.source}: no part of {config.layout.shortest:g} s is left; left out: "
     message += ", ".join(f"{number} rows {reason}" for reason, number in reasons.items()) or "none"
     causes = [*_time_doubts(reports, period, config.layout)]
+    if (gaps := sum(each.gaps for each in reports)) and not config.layout.resample:
+        causes.append(
+            f"rows are missing in {gaps} places: give a smaller layout.shortest, or layout.resample=true, "
+            f"which bridges up to {LONGEST_GAP - 1} rows"
+        )
     return "; ".join((message, *causes))
 
 
@@ -173,7 +184,9 @@ def doubts(reports: Sequence[Report], sensors: Sensors, period: float, layout: L
             f"layout.angle.positive{half_a_turn if sensors.falls_upwards is None else ''}"
         )
     rows = sum(each.rows for each in reports)
-    if leaps := angle_leaps(reports, period):
+    if wraps := wrong_wrap(reports, layout):
+        yield wraps
+    elif leaps := angle_leaps(reports, period):
         first = next(each.leap for each in reports if each.leaps)
         yield f"the angle leaps in {leaps} of {rows} rows, first in {first}: " + (
             "mend layout.angle.unit; the column may be in degrees"
@@ -194,9 +207,15 @@ def doubts(reports: Sequence[Report], sensors: Sensors, period: float, layout: L
         )
     signs_fit = sensors.push >= -CORRELATED and sensors.lag >= -CORRELATED
     if signs_fit and not stale:
-        yield from _scale_doubts(sensors, layout)
+        yield from _scale_doubts(sensors, layout, angle_jump(reports, layout))
         yield from _delay_doubts(sensors, period, layout)
     yield from _time_doubts(reports, period, layout)
+    unknown = sum(each.left_out.get(UNKNOWN, 0) for each in reports)
+    if unknown > LACKING * rows:
+        yield (
+            f"{unknown} of {rows} rows were left out, {UNKNOWN}: of a column that is written less often than "
+            "the others, repeat the last value"
+        )
     if beyond := sum(each.beyond for each in reports):
         full = f"layout.motor.full={layout.motor.full:g}"
         yield f"{beyond} of {rows} motor values are beyond {full}: give the largest"
@@ -213,6 +232,38 @@ def angle_leaps(reports: Sequence[Report], period: float) -> int:
     leaps, anew = sum(each.leaps for each in reports), any(each.anew for each in reports)
     many = leaps > LEAPS * sum(each.rows for each in reports)
     return leaps if many or (anew and period <= QUICK) else 0
+
+
+def angle_jump(reports: Sequence[Report], layout: Layout) -> float:
+    """Return by how many units the angle jumps where its column wraps; 0 if it does not, or that was told."""
+    wraps = [each.wrap for each in reports if each.wrap]
+    if not wraps or not isinstance(layout.angle.wraps, bool):
+        return 0.0
+    jump = float(np.median(wraps)) * units_of_turn(layout)
+    likely = (*TURN.values(), *(2.0**bits for bits in range(8, 25)))
+    return next((size for size in likely if abs(jump / size - 1) < WRAP), jump)
+
+
+def units_of_turn(layout: Layout) -> float:
+    """Return how many units of the angle's column a turn has, by the layout."""
+    unit = layout.angle.unit
+    return TURN[unit] if isinstance(unit, str) else unit
+
+
+def wrong_wrap(reports: Sequence[Report], layout: Layout) -> str:
+    """Return a sentence if the angle jumps by other than whole turns."""
+    jump, turn, name = angle_jump(reports, layout), units_of_turn(layout), layout.angle.name
+    turns = jump / turn
+    if not jump or abs(turns - max(1, round(turns))) <= WRAP:
+        return ""
+    said = f"the angle jumps by {jump:.6g} where {name} wraps, and a turn has {turn:.6g}: "
+    for unit, size in TURN.items():
+        if jump == size and not ALMOST < turns < 1 / ALMOST:
+            return f"{said}the column may be in {UNITS[unit]}; give layout.angle.unit={unit}"
+    return (
+        f"{said}give layout.angle.wraps={jump:.6g}, or mend layout.angle.unit; of a potentiometer with a "
+        "dead zone, leave its ends out by layout.keep"
+    )
 
 
 def _time_doubts(reports: Sequence[Report], period: float, layout: Layout) -> Iterator[str]:
@@ -248,16 +299,16 @@ def _time_doubts(reports: Sequence[Report], period: float, layout: Layout) -> It
         )
 
 
-def _scale_doubts(sensors: Sensors, layout: Layout) -> Iterator[str]:
+def _scale_doubts(sensors: Sensors, layout: Layout, jump: float) -> Iterator[str]:
     scale, zero, position = sensors.angle_scale, sensors.angle_zero, sensors.position_scale
     if scale is not None and not scale.holds(1, ANGLE_SCALE):
-        unit = layout.angle.unit
-        turn = TURN[unit] if isinstance(unit, str) else unit
+        turn = units_of_turn(layout)
         factor = _or_unit(scale.value)
+        wraps = f", and where it wraps as layout.angle.wraps={jump:.6g}" if jump else ""
         yield (
             f"the angle's scale is refuted by its motion: it turns {factor} as far as recorded; a turn has "
             f"{turn / scale.value:.5g} units of {layout.angle.name} (95 %: {turn / scale.high:.5g} to "
-            f"{turn / scale.low:.5g}), not {turn:.5g}: give it as layout.angle.unit"
+            f"{turn / scale.low:.5g}), not {turn:.5g}: give it as layout.angle.unit{wraps}"
         )
     elif zero is not None and not zero.holds(0, ANGLE_ZERO):
         yield (
@@ -345,6 +396,8 @@ def print_summary(
         if estimate is not None:
             value, low, high = (factor * each for each in estimate)
             print(f"{name}: {value:.4g}{unit} (95 %: {low:.4g} to {high:.4g})")
+    if not (sensors.angle_scale or sensors.position_scale or sensors.delay):
+        print("the recordings are too short, or show too little motion, to question their sensors")
     for doubt in found:
         print(f"doubt: {doubt}")
     cart = "" if config.hardware == nominal_hardware() else " cart=<yours>.yaml"

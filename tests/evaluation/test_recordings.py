@@ -12,7 +12,14 @@ import torch
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import RecordingError
 from cartpole_rl.evaluation.episodes import run_batch
-from cartpole_rl.evaluation.recordings import COLUMNS, GUARDED, read_heading, read_recording, write_recording
+from cartpole_rl.evaluation.recordings import (
+    COLUMNS,
+    GUARDED,
+    Recording,
+    read_heading,
+    read_recording,
+    write_recording,
+)
 from cartpole_rl.rig.hardware import Encoders, nominal_encoders
 from cartpole_rl.tasks.episode import Episode
 
@@ -35,6 +42,12 @@ def with_cell(text: str, row: int, column: str, value: str) -> str:
     cells[lines[first].split(",").index(column)] = value
     lines[first + row] = ",".join(cells)
     return "\n".join(lines) + "\n"
+
+
+@pytest.mark.parametrize("length", ["nan", "-1", "0", "long"])
+def test_a_length_that_is_none_is_named(length: str, episode: Episode) -> None:
+    with pytest.raises(RecordingError, match=f"recording own is damaged: pole_length_m is '{length}'"):
+        _ = Recording("own", episode, {"pole_length_m": length}).pole_length
 
 
 def test_a_recording_round_trips(tmp_path: Path, episode: Episode) -> None:

@@ -26,7 +26,7 @@ from cartpole_rl.identification.settings import ImportConfig, Layout
 from cartpole_rl.identification.windows import cut_windows
 from cartpole_rl.rig.hardware import Encoders, nominal_encoders
 from cartpole_rl.run_folder import experiments
-from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.tasks.episode import Episode, wrap
 from cartpole_rl.workflows.import_logs import import_logs
 
 PERIOD, STEPS, LENGTH = 0.02, 1500, 0.3  # s; length of the equivalent simple pendulum, m
@@ -439,6 +439,9 @@ def test_the_period_is_the_mean_gap(tmp_path: Path, motion: Columns) -> None:
             "t,x,a,u\n0,0,0,0\n0.1,0,0,0\n0.1,1,0,0\n",
             r"the time t is 0\.1 in rows 2 and 3; write it with more digits, or leave one of the rows out",
         ),
+        ("t,x,a,u\n0,,0,0\n1,0,0,0\n1,1,0,0\n", "the time t is 1 in rows 2 and 3"),
+        ("t,x,a,u\n0,0,0,1_0\n", "line 2: u is '1_0'"),
+        (f"t,x,a,u\n0,0,0,{'-' * 50}\n", f"line 2: u is '{'-' * 40}...'"),
         ("t,x,a,u\n0,0,0,0\n9,0,0,0\n1,0,0,0\n", "the time t goes from 9 to 1 s after row 2; sort the rows"),
     ],
 )
@@ -447,6 +450,27 @@ def test_a_bad_log_is_one_line(tmp_path: Path, text: str, message: str) -> None:
     path.write_text(text)
     with pytest.raises(RecordingError, match=message):
         read_log(path, layout(), nominal_encoders())
+
+
+def test_a_point_is_no_decimal_where_a_comma_is(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text("t;x;a;u\n0;0,5;0;-2.583\n")
+    with pytest.raises(RecordingError, match=r"line 2: u is '-2\.583'; give a number, or mend decimal="):
+        read_log(tmp_path / "log.csv", layout(decimal=","), nominal_encoders())
+
+
+def test_a_wrong_unit_of_the_time_invents_no_rows(tmp_path: Path, motion: Columns) -> None:
+    path = written(tmp_path / "log.csv", {**motion, "t": 1e6 * motion["t"]})
+    with pytest.raises(RecordingError, match=r"log\.csv: its rows are 2e\+07 ms apart, .* mend layout\.time"):
+        read_log(path, layout(resample=True, period=0.02), nominal_encoders())
+
+
+def test_a_late_stamp_is_no_fast_cart(tmp_path: Path, motion: Columns) -> None:
+    """The row after it seems to come at once."""
+    time = motion["t"].copy()
+    time[400] += 0.9999 * PERIOD
+    log = read_log(written(tmp_path / "log.csv", {**motion, "t": time}), layout(resample=True), ENCODERS)
+    assert np.abs(np.diff(motion["x"]))[400] > 5 * np.diff(time)[400]
+    assert log.report.jumps == 0
 
 
 @pytest.mark.parametrize(
@@ -534,6 +558,20 @@ BROKEN: dict[str, tuple[Callable[[Columns], Columns], list[str]]] = {
         ["angle.positive", "the time between rows varies"],
     ),
     "degrees": (lambda each: {**each, "a": np.degrees(each["a"])}, ["may be in degrees"]),
+    "radians, told as degrees": (lambda each: {**each, "a": np.radians(each["a"])}, ["may be in radians"]),
+    "degrees that wrap": (
+        lambda each: {**each, "a": np.degrees(wrap(each["a"]))},
+        [r"jumps by 360 where a wraps.*in degrees; give layout\.angle\.unit=deg$"],
+    ),
+    "scale of 4 %, with wraps": (
+        lambda each: {**each, "a": wrap(1.04 * each["a"])},
+        [r"0\.96\d times as far.* as layout\.angle\.wraps=6\.28319$"],
+    ),
+    "half the scale": (lambda each: {**each, "a": each["a"] / 2}, [r"(2\.0|1\.9)\d+ times as far"]),
+    "a motor value in every second row": (
+        lambda each: {**each, "u": np.where(np.arange(STEPS) % 2, np.nan, each["u"])},
+        ["750 of 1500 rows were left out, with an empty cell .* repeat the last value"],
+    ),
     "scale of 4 %": (lambda each: {**each, "a": 1.04 * each["a"]}, [r"0\.96\d times as far"]),
     "zero": (lambda each: {**each, "a": each["a"] + 0.06}, ["upright at a recorded angle of 3"]),
     "millimetres": (lambda each: {**each, "x": 1e3 * each["x"]}, ["may be in mm"]),
@@ -556,7 +594,7 @@ BROKEN: dict[str, tuple[Callable[[Columns], Columns], list[str]]] = {
     ),
     "pole's counter of 16 bits": (
         lambda each: {**each, "a": each["a"] % 4},
-        [r"^the angle leaps in \d+ of 1500 rows, first in row \d+ of log.csv: .* as layout.angle.wraps"],
+        [r"^the angle jumps by 3\.999\d+ where a wraps, .* 6\.28319: give layout\.angle\.wraps=3\.999"],
     ),
     "one leap": (
         lambda each: {**each, "a": each["a"] + 10 * (np.arange(STEPS) > 700)},
@@ -696,10 +734,12 @@ def test_a_file_beside_the_logs_is_left_out(
 
 def test_no_log_of_a_folder_replaces_another(tmp_path: Path, motion: Columns) -> None:
     (tmp_path / "logs").mkdir()
-    for name in ("a.csv", "a.txt", "01_run.csv", "02_run.csv"):
+    names = "a.csv", "a.txt", "a.csv.txt", "01_run.csv", "02_run.csv"
+    for name in names:
         written(tmp_path / "logs" / name, {column: values[:200] for column, values in motion.items()})
+    (tmp_path / "logs/a_folder.csv").mkdir()
     import_logs(imported(tmp_path / "logs"), tmp_path / "run")
-    assert len(experiments(tmp_path / "run")) == 4
+    assert len(experiments(tmp_path / "run")) == len(names)
 
 
 def test_a_position_that_no_encoder_counts_is_one_line(tmp_path: Path, motion: Columns) -> None:
