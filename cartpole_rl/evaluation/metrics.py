@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
 from cartpole_rl.settings import CONFIDENCE
 from cartpole_rl.tasks.episode import Ending, Episode, is_upright, upright_at_end, upright_since, wrap
@@ -85,6 +84,8 @@ def _rms(values: np.ndarray) -> float | None:
 
 def interval(values: Sequence[float]) -> tuple[float, float] | tuple[None, None]:
     """Return the 95 % interval of the mean by BCa bootstrap (Efron, 1987); (None, None) for one value."""
+    from scipy import stats  # slow to import
+
     data = np.asarray(values, dtype=float)
     if len(data) < 2:
         return None, None

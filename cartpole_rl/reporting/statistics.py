@@ -17,7 +17,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
 
 from cartpole_rl.settings import CONFIDENCE
 
@@ -109,6 +108,8 @@ def _share_above(values: Array, others: Array) -> Array:
 
     It is Mann and Whitney's U, from ranks, so that pairs need no memory.
     """
+    from scipy import stats  # slow to import
+
     n, m = values.shape[-1], others.shape[-1]
     ranks = stats.rankdata(np.concatenate([values, others], axis=-1), axis=-1)
     pairs = ranks[..., :n].sum(axis=-1) - n * (n + 1) / 2
@@ -120,6 +121,8 @@ def performance_profile(values: ArrayLike, scores: ArrayLike) -> tuple[Array, Ar
 
     The interval is that of the bootstrap: a resampled share is binomial.
     """
+    from scipy import stats  # slow to import
+
     ordered = np.sort(np.asarray(values, dtype=float))
     share = 1 - np.searchsorted(ordered, np.asarray(scores, dtype=float), side="right") / ordered.size
     low, high = (stats.binom.ppf(edge / 100, ordered.size, share) / ordered.size for edge in EDGES)
