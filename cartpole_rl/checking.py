@@ -68,12 +68,14 @@ def validated(
         return schema(**values)
     except ValidationError as error:
         complaints: dict[str, str] = {}
+        wrong = tuple(_key(detail) for detail in error.errors() if detail["type"] == "extra_forbidden")
+        unknown = {name for name in setting_names(values) if name.startswith(wrong)} if wrong else set()
         for detail in error.errors():
             key = _key(detail)
             if key in complaints:  # another member of a union
                 complaints[key] += f", or {_reason(detail).removeprefix('give ')}"
             else:
-                complaints[key] = f"{source(key)}{_complaint(detail, schema, values)}"
+                complaints[key] = f"{source(key)}{_complaint(detail, schema, values, unknown)}"
         raise ConfigError("; ".join(complaints.values())) from None
 
 
@@ -81,11 +83,16 @@ def _key(detail: Mapping[str, Any]) -> str:
     return TAGS.sub("", ".".join(map(str, detail["loc"])))
 
 
-def _complaint(detail: Mapping[str, Any], schema: type[Settings], values: Mapping[str, Any]) -> str:
+def _complaint(
+    detail: Mapping[str, Any], schema: type[Settings], values: Mapping[str, Any], unknown: set[str]
+) -> str:
+    """Return what is wrong; settings that are `unknown` themselves are not meant by others."""
     key = _key(detail)
     match detail["type"]:
         case "extra_forbidden":
-            return no_such_setting(key, (name for name in setting_names(values) if not name.startswith(key)))
+            if key.startswith("pole.pole_"):
+                return f"{key}: a pole's numbers stand under its name: choices: {{mine: {{pole_mass: ...}}}}"
+            return no_such_setting(key, setting_names(values) - unknown)
         case "missing":
             return missing(key)
         case "union_tag_invalid":  # a plant that this command does not take

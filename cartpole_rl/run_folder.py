@@ -113,6 +113,8 @@ def check_program(setting: str, folder: Path, *taken: str) -> None:
     """Raise ConfigError if `folder` is a run of a command that is not among `taken`."""
     if (folder / MULTIRUN).is_file():
         jobs = sorted(path for path in folder.iterdir() if path.is_dir() and path.name[0] != ".")
+        if setting == "resume":
+            jobs = [job for job in jobs if (job / CHECKPOINTS / RESUME).exists()]
         example = f": {as_word(setting, jobs[0])}" if jobs else ""
         raise ConfigError(
             f"{setting}={folder} is a folder of a multirun; give that of one of its jobs{example}"

@@ -126,15 +126,16 @@ def _alive() -> Iterator[None]:
 
 
 class _Ended(BaseException):
-    """SIGTERM, SIGHUP or the end of the parent: unwinds, so that the motor is stopped."""
+    """SIGINT, SIGTERM, SIGHUP or the end of the parent: unwinds, so that the motor is stopped."""
 
 
 def _serve(
     pipe: Connection, make_env: MakeEnv, make_policy: Callable[[], nn.Module], real_time: bool, parent: int
 ) -> None:
     endings = ending_signals()
+    if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
+        endings.append(signal.SIGINT)  # of a terminal, to both processes: the parent may be starved
     RaiseOnce(_Ended).handle(*endings)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent gets it too, and ends this process
     end_with_parent(parent)
     torch.set_num_threads(1)
     with suppress(_Ended, EOFError, ConnectionError):

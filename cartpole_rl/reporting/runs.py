@@ -34,6 +34,7 @@ from cartpole_rl.run_folder import (
     is_outdated,
 )
 
+RUNS = "runs"  # the folder in which commands make their runs
 RESULTS = {"identify": (IDENTIFIED,), "model": (MODELLED,), "finetune": (METRICS, COMPARISON)}
 EPISODIC = ("evaluate", "record")  # commands that keep what they have after an interruption
 # packages whose versions change results
@@ -199,17 +200,27 @@ def _outdated(run: Run) -> str:
         return "a run that it needs was made again since, with another result"
     used = run.provenance.get(AGENT_HASH)
     if used and not (run.folder / INPUTS).is_file():
-        found = {*_hashes(run)}
+        found = {known for _, known in _agents(run)}
         if found and used not in found:
             return f"its agent {run.agent} has another checkpoint now; repeat it"
     return ""
 
 
-def _hashes(run: Run) -> Iterator[str]:
-    """Yield the hashes of what may be the agent of a run: moved runs name it as before."""
-    for place in (Path(), *run.folder.absolute().parents):
-        with suppress(CheckpointError, OSError):
-            yield file_hash(find_agent(place / run.agent))
+def place_of_agent(run: Run) -> Path:
+    """Return where the agent of a run is: the place with its hash, or else as the run names it."""
+    used = run.provenance.get(AGENT_HASH)
+    return next((place for place, known in _agents(run) if known == used), Path(run.agent))
+
+
+def _agents(run: Run) -> Iterator[tuple[Path, str]]:
+    """Yield what may be the agent of a run, with its hash: moved and copied runs name it as before."""
+    named = Path(run.agent)
+    parts = named.parts
+    inside = Path(*parts[parts.index(RUNS) :]) if named.is_absolute() and RUNS in parts else named
+    for folder in (*run.folder.absolute().parents, Path()):
+        for place in dict.fromkeys((folder / named, folder / inside)):
+            with suppress(CheckpointError, OSError):
+                yield place, file_hash(find_agent(place))
 
 
 def _results(folder: Path, program: str) -> dict[str, Any]:

@@ -23,6 +23,7 @@ from cartpole_rl.reporting.runs import (
     learning_curve,
     measured,
     partly_measured_note,
+    place_of_agent,
     read_run,
     run_of,
     short,
@@ -392,8 +393,8 @@ def _member(run: Run, agents: dict[Path, Run]) -> Member:
         tree[AGENT] = _agent_tree((run, *chain))
     elif run.agent:
         tree[SOURCE] = run.agent
-    drives = run.program in EPISODIC and (chain or Path(run.agent).parts[:1] == (PRETRAINED,))
-    made_by = chain if drives else [run, *chain]
+    trained = run.agent and run.agent != str(BASELINE) and not is_own_policy(Path(run.agent))
+    made_by = chain if run.program in EPISODIC and trained else [run, *chain]  # a lost one has no known seed
     return Member(run, chain[0] if chain else None, tree, tuple(each.seed or 0 for each in made_by))
 
 
@@ -405,7 +406,7 @@ def _chain(run: Run, agents: dict[Path, Run]) -> list[Run]:
     chain: list[Run] = []
     last = run
     while last.agent:
-        folder = run_of(Path(last.agent))
+        folder = run_of(place_of_agent(last))
         if folder not in agents and folder.is_dir():
             agents[folder] = read_run(folder)
         found = agents.get(folder)

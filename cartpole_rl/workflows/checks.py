@@ -18,7 +18,7 @@ from cartpole_rl.envs.settings import shipped_carts
 from cartpole_rl.errors import CheckpointError, ConfigError
 from cartpole_rl.identification.settings import ImportConfig, log_files, logs_in
 from cartpole_rl.plants.settings import emulated_pole
-from cartpole_rl.randomization.poles import Pole, check_one_pole
+from cartpole_rl.randomization.poles import Pole, PoleSettings, check_one_pole
 from cartpole_rl.randomization.ranges import check_carts
 from cartpole_rl.rig.hardware import check_track, parameters_of
 from cartpole_rl.rig.parameters import check_names, check_value, check_values, completed
@@ -50,6 +50,7 @@ from cartpole_rl.workflows.config import (
     ReplayConfig,
     TrainConfig,
 )
+from cartpole_rl.workflows.poles import lengths
 
 LARGEST_BATCH = 1024  # carts that an evaluation simulates at once
 LONGER = {  # command: how to train further than a run that has ended
@@ -101,6 +102,7 @@ def check_evaluation(config: EvaluateConfig, words: Sequence[str]) -> None:
             f"run={config.run}: only a trained agent can drive on the board; give its run folder"
         )
     config.plant.check()
+    check_stated_pole(config.pole, config)
     check_parameters(config.parameters or {})
     if config.animation.mp4:
         check_installed("animation.mp4=true", "video")
@@ -216,6 +218,17 @@ def check_identification(config: IdentifyConfig) -> None:
         experiments(config.source)
     elif config.plant.reads_emulator:
         check_emulated_pole(config)
+    else:
+        check_stated_pole(config.pole, config)
+
+
+def check_stated_pole(pole: PoleSettings | None, config: EvaluateConfig | IdentifyConfig) -> None:
+    """Raise ConfigError if pole= and plant.pole_length state two poles on a real cart."""
+    length = None if config.plant.reads_emulator else config.plant.known_pole_length(config.emulator)
+    if pole is not None and length is not None and not pole.includes(Pole.rod(length)):
+        raise ConfigError(
+            f"plant.pole_length={length:g}: pole= states {lengths(pole)}; leave one of them out, or mend it"
+        )
 
 
 def check_emulated_pole(config: IdentifyConfig) -> None:

@@ -1,5 +1,6 @@
 """Check a cart by small moves before an agent drives it."""
 
+import shlex
 from collections.abc import Sequence
 from contextlib import closing
 
@@ -50,7 +51,7 @@ def next_command(config: PreflightConfig, words: Sequence[str] = ()) -> str:
     if config.hardware == nominal_hardware():
         pole = pole if pole in PRETRAINED else PRETRAINED[0]
         return f"cartpole-evaluate run=pretrained/{pole} task=balance {plant} episodes=1"
-    cart = [word for word in words if word.startswith(("cart=", "cart."))]
+    cart = [shlex.quote(word) for word in words if word.startswith(("cart=", "cart."))]
     return " ".join(["cartpole-identify", *cart, plant, f"pole={pole or '<yours>.yaml'}"])
 
 

@@ -37,6 +37,7 @@ from cartpole_rl.workflows.poles import emulated_words, words_of_run
 
 ROUNDING = 1e-6  # share: that of float32
 FALLEN = 0.9  # of the best score: a training that ends below it says so
+ROUNDING = 1e-6  # m
 LEAST = 10.0  # score of an agent that has learned something
 
 
@@ -150,10 +151,25 @@ def print_notes(config: TrainConfig, draws: Draws) -> None:
     """Print how the cart differs from the nominal one and from those in training, and its track guard."""
     if "cart" not in config.plant.ignored:
         note_other_numbers("train", config.nominal_cart, (config.pole.choices or {}).values())
+        note_blocked_track(config)
     note_unused_randomization(config, draws)
     note_other_carts(config, draws)
     if config.guard.active:
         print_message("train", f"track guard: {config.guard.active}")
+
+
+def note_blocked_track(config: TrainConfig) -> None:
+    """Print that the cart's firmware blocks a part of the track that the training uses."""
+    end, soft = (
+        config.nominal_cart["track_half_length"],
+        config.hardware.half_span - config.hardware.soft_limit,
+    )
+    if end > soft + ROUNDING:
+        print_message(
+            "train",
+            f"note: cart.track_half_length is {end:g} m, and from the soft limit at {soft:g} m on "
+            "(half of track_span, less soft_limit) the cart takes no outward motor value",
+        )
 
 
 def warn_of_changes(drawn_from: Mapping[str, str]) -> None:

@@ -1,5 +1,6 @@
 """cartpole-preflight as a user runs it: on the emulated cart, and on a port without a cart."""
 
+import shlex
 from pathlib import Path
 
 import hydra
@@ -58,6 +59,13 @@ def test_the_next_command_is_for_the_same_cart(given: tuple[str, ...], following
     settings = dict(word.split("=") for word in given)
     config = validated(PreflightConfig, compose("preflight", settings))
     assert next_command(config) == f"cartpole-evaluate run=pretrained/{following} episodes=1"
+
+
+def test_the_file_of_another_cart_is_quoted_in_the_next_command() -> None:
+    config = validated(PreflightConfig, compose("preflight", {"cart": "stepper", "plant.port": "x"}))
+    following = next_command(config, ["cart=my cart.yaml", "plant.port=x"])
+    words = ["cart=my cart.yaml", "plant=serial", "plant.port=x", "pole=<yours>.yaml"]
+    assert shlex.split(following) == ["cartpole-identify", *words]
 
 
 def test_a_port_without_a_cart_is_reported(tmp_path: Path) -> None:

@@ -94,6 +94,16 @@ def contents(folder: Path) -> dict[str, tuple[int, int]]:
     return {str(path): (path.stat().st_size, path.stat().st_mtime_ns) for path in files}
 
 
+def test_a_job_that_can_be_resumed_is_named(runs: Path, tmp_path: Path) -> None:
+    jobs = tmp_path / "sweep"
+    shutil.copytree(runs / "multirun", jobs)
+    complaint = in_process("train", "resume=sweep", folder=tmp_path).complaint
+    assert complaint.endswith("is a folder of a multirun; give that of one of its jobs")
+    shutil.copytree(runs / "unfinished", jobs / "9_seed-1")
+    complaint = in_process("train", "resume=sweep", folder=tmp_path).complaint
+    assert complaint.endswith("give that of one of its jobs: resume=sweep/9_seed-1")
+
+
 def test_runs_that_cannot_be_used_as_others_of_their_command(tmp_path: Path) -> None:
     """An evaluation of a cart cannot be repeated; an interrupted identification has recordings alone."""
     for command, about in (

@@ -20,7 +20,8 @@ from cartpole_rl.physics.models import Models
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.tasks.features import ObservationKind
 from cartpole_rl.tasks.settings import StartSettings
-from cartpole_rl.workflows.train import fall_note
+from cartpole_rl.workflows.config import TrainConfig, load_settings
+from cartpole_rl.workflows.train import fall_note, note_blocked_track
 
 MOTORS = tuple(choice("actions/nine_levels")["motors"])
 SMALL = ["compile=false", "agent.hidden=[64,64]", "agent.target_tau=0.02", "learning.batch_size=256"]
@@ -113,6 +114,13 @@ def test_a_preview_is_a_picture_and_no_training(tmp_path: Path) -> None:
     assert [path.name for path in (tmp_path / "run").iterdir()] == ["figures"]
     done = in_process("train", "preview=true", "randomization=none", folder=tmp_path)
     assert "preview: randomization draws the nominal cart alone" in done.complaint
+
+
+def test_a_track_beyond_the_soft_limit_is_noted(capsys: pytest.CaptureFixture[str]) -> None:
+    for end, noted in ((0.38, False), (0.39, True)):
+        note_blocked_track(load_settings(TrainConfig, {"cart.track_half_length": end}))
+        said = "cart.track_half_length is 0.39 m, and from the soft limit at 0.38 m on"
+        assert (said in capsys.readouterr().err) == noted
 
 
 def test_a_training_that_became_worse_says_so() -> None:

@@ -74,38 +74,38 @@ def driver(peer: CartPeer, confirm: Confirm) -> Driver:
     return Driver(partial(scripted_env, peer.port), network, False, confirm)
 
 
-def test_a_person_is_asked_and_a_hangup_stops_the_motor(
-    peer: Faulty, capfd: pytest.CaptureFixture[str]
-) -> None:
-    """The person declines, then confirms; the terminal is closed while the cart is driven."""
-    drive, asked = EpisodeRequest(as_weights(network()), 0.0, 0), []
-
-    def answering(agreed: bool) -> Confirm:
-        def confirm(text: str) -> bool:
-            asked.append(text)
-            if agreed:
-                threading.Thread(target=hang_up).start()
-            return agreed
-
-        return confirm
-
-    def hang_up() -> None:
-        deadline = time.monotonic() + 60
-        while not any(message.motor for message in peer.messages(SetMotor)):
-            assert time.monotonic() < deadline
-            time.sleep(0.01)
-        os.kill(driving.pid, signal.SIGHUP)
-
-    with driver(peer, answering(False)) as driving:
-        driving.start(drive)
+def test_a_person_who_declines_is_an_error(peer: Faulty, capfd: pytest.CaptureFixture[str]) -> None:
+    with driver(peer, lambda text: False) as driving:
+        driving.start(EpisodeRequest(as_weights(network()), 0.0, 0))
         with pytest.raises(FaultError, match=r"the motor was driven but the cart did not move.*confirm"):
             driving.result()
     assert "Traceback" not in capfd.readouterr().err
 
-    with driver(peer, answering(True)) as driving:
-        driving.start(drive)
+
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGINT])
+def test_a_hangup_and_ctrl_c_stop_the_motor(
+    number: signal.Signals, peer: Faulty, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """A person confirms; then the terminal signals the process that drives the cart, too."""
+    asked = []
+
+    def confirm(text: str) -> bool:
+        asked.append(text)
+        threading.Thread(target=end).start()
+        return True
+
+    def end() -> None:
+        deadline = time.monotonic() + 60
+        while not any(message.motor for message in peer.messages(SetMotor)):
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        os.kill(driving.pid, number)
+
+    with driver(peer, confirm) as driving:
+        driving.start(EpisodeRequest(as_weights(network()), 0.0, 0))
         with pytest.raises(LinkError, match="has died"):
             driving.result()
-    assert len(asked) == 2
+    assert len(asked) == 1
+    assert "Traceback" not in capfd.readouterr().err
     assert [type(frame.message) for frame in peer.received[-2:]] == [SetMotor, Stop]
     assert peer.state.motor_applied == 0

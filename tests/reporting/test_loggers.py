@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 from command_line import in_process
+from serial_peer import wait_for
 from toy_settings import TOY
 
 from cartpole_rl.errors import ConfigError, LearningError
@@ -181,8 +182,13 @@ def test_a_failed_training_has_failed_in_wandb(tmp_path: Path) -> None:
     log.fail(LearningError("diverged"))
     log.close()
     (file,) = tmp_path.glob("wandb/offline-run-*/*.wandb")
-    records = map(Record.FromString, stored(file.read_bytes()))
-    assert [each.exit.exit_code for each in records if each.HasField("exit")] == [1]
+
+    def exit_codes() -> list[int]:
+        records = map(Record.FromString, stored(file.read_bytes()))
+        return [each.exit.exit_code for each in records if each.HasField("exit")]
+
+    wait_for(lambda: bool(exit_codes()), 60)  # another process writes them
+    assert exit_codes() == [1]
 
 
 @pytest.mark.parametrize("name", ["wandb", "mlflow"])

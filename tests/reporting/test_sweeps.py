@@ -13,6 +13,7 @@ from cartpole_rl.errors import ConfigError
 from cartpole_rl.reporting.runs_page import comparison
 from cartpole_rl.reporting.sweeps import Sweep, grouped, read_groups, read_sweeps, results_of
 from cartpole_rl.reporting.tables import run_rows
+from cartpole_rl.run_folder import file_hash
 
 Edit = Callable[[Path, Callable[[Any], object]], None]
 MEASURE = "score_upright"
@@ -156,6 +157,32 @@ def test_the_agents_of_evaluations_count(study: Path, edit: Edit) -> None:
     edit(study / "much/10/evaluations/heavy/config.yaml", lambda content: content.update(run="."))
     (lost,), _ = grouped([read_sweep("runs", ["quick/friction/*/*/evaluations/heavy"], MEASURE)])
     assert "The runs of 3 agents were not found and are not checked." in results_of(lost, MEASURE).notes
+
+
+def test_an_agent_is_found_by_its_hash_from_anywhere(
+    study: Path, edit: Edit, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another project has another agent of the same name; an absolute path is of before a copy."""
+    heavy, runs = study / "much/10/evaluations/heavy", []
+    for place, seed in ((study / "runs/first", 7), (Path("other/runs/first"), 8)):
+        shutil.copytree(study / "much/11/evaluations/heavy", place)
+        edit(place / "config.yaml", lambda content, seed=seed: content.update(seed=seed))
+        (place / "checkpoints").mkdir()
+        (place / "checkpoints/last.pt").write_bytes(bytes([seed]))
+    used = file_hash(study / "runs/first/checkpoints/last.pt")
+    edit(heavy / "provenance.json", lambda content: content.update(agent_sha256=used))
+    home = heavy.absolute()
+    monkeypatch.chdir("other")
+    for named in ("runs/first", "/elsewhere/runs/first"):
+        edit(home / "config.yaml", lambda content, named=named: content.update(run=named))
+        (member,) = read_sweep("runs", [str(home)], MEASURE).members
+        runs.append((member.agent and member.agent.folder, member.seeds))
+    assert runs == [(home.parents[3] / "runs/first", (7,))] * 2
+    (home.parents[3] / "runs/first").rename(home.parents[3] / "renamed")
+    edit(home / "config.yaml", lambda content: content.update(run="runs/first", seed=5))
+    shutil.rmtree("runs")
+    (member,) = read_sweep("runs", [str(home)], MEASURE).members
+    assert (member.agent, member.seeds) == (None, ())  # the seed of the evaluation is not the agent's
 
 
 def test_versions_and_commands_are_compared_over_both_sets(study: Path, edit: Edit) -> None:

@@ -40,6 +40,7 @@ LISTENED_TO_ARRIVALS = 1.0  # s for a board that does not send its time
 FEW_LOST = 3  # gaps between two measurements, in medians: in longer ones the board was not heard
 PERIOD_TOLERANCE = 0.05  # share
 SAMPLES = 3  # measurements by which the limits know the speed
+MOST_COUNTS = 2**31 - 1  # in a STATE
 LEAK = 0.01  # largest difference between the rates of the two clocks
 LATE_PERIODS = 1.5  # without a measurement, after which the rules look at the clock alone
 MOST_BAD = 50  # damaged measurements more than whole ones
@@ -492,6 +493,8 @@ class Bridge:
             us = now_us if given.us is None else self._unwrapped(index(given.us))
         except TypeError:
             return self._refuse(f"{given} is not in whole counts and us")
+        if max(abs(cart), abs(pole)) > MOST_COUNTS:
+            return self._refuse(f"{given} has a count beyond 32 bits: give signed ones")
         settings, last = self._settings, self._last
         carried = self._potentiometer.count(pole, us)
         if carried is not None:

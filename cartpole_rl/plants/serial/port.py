@@ -35,6 +35,9 @@ BOARDS = {  # vendor ids of chips on ESP32, Arduino and Nucleo boards
 }
 
 
+NOT_ITS_OWN = "", "0", "0001"  # serial numbers of CH340 and of many CP210x
+
+
 @dataclass(frozen=True, order=True)
 class UsbPort:
     """A serial port on USB. Texts are empty if the device has none."""
@@ -44,11 +47,13 @@ class UsbPort:
     product: int  # USB product id
     name: str = ""  # what the device calls itself
     serial_number: str = ""
+    location: str = ""  # the USB socket
 
     @property
     def identity(self) -> tuple[int, int, str]:
-        """What tells this device from another, wherever it is plugged in."""
-        return self.vendor, self.product, self.serial_number
+        """What tells this device from another: without a serial number of its own, where it is plugged in."""
+        own = self.serial_number if self.serial_number not in NOT_ITS_OWN else f"at {self.location}"
+        return self.vendor, self.product, own
 
 
 def open_port(port: str, baud: int, write_timeout: float) -> serial.SerialBase:
@@ -118,9 +123,10 @@ def port_of(earlier: UsbPort, port: str) -> str:
         return paths[0]
     if len(paths) == 1:
         raise PortError(f"the cart that was at {port} is at {paths[0]} now: give plant.port={paths[0]}")
+    where = " where it was" if earlier.serial_number in NOT_ITS_OWN else ""
     raise PortError(
         f"the cart's port ({described(earlier)}) is gone; there are {named(ports) or 'none'}: plug the same "
-        "cart in again, or start the command again for another one"
+        f"cart in again{where}, or start the command again for another one"
     )
 
 
@@ -198,7 +204,14 @@ class TcpPort(SocketPort):
 def usb_ports(ports: Iterable[ListPortInfo]) -> list[UsbPort]:
     """Return pyserial's ports that are on USB, sorted; a computer's own ports have no vendor id."""
     return sorted(
-        UsbPort(port.device, port.vid, port.pid or 0, port.product or "", port.serial_number or "")
+        UsbPort(
+            port.device,
+            port.vid,
+            port.pid or 0,
+            port.product or "",
+            port.serial_number or "",
+            port.location or "",
+        )
         for port in ports
         if port.vid is not None
     )

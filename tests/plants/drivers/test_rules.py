@@ -393,6 +393,8 @@ def test_a_measurement_without_whole_counts_is_refused(bad: Any) -> None:
     bridge = Playing()
     assert bridge.measure(0, bad, 1) == [True, False, True]
     assert "is not in whole counts" in bridge.played.why_bad
+    assert bridge.measure(0, 2**32 - 6, 1) == [True, False, True]
+    assert "has a count beyond 32 bits" in bridge.played.why_bad
 
 
 def test_no_command_is_infinite() -> None:

@@ -32,6 +32,7 @@ from cartpole_rl.plants.settings import SerialSettings
 def listed(device: str, vid: int | None, product: str | None = None) -> ListPortInfo:
     port = ListPortInfo(device)
     port.vid, port.pid, port.product = vid, 0x7523 if vid else None, product
+    port.location = "1-1.2" if vid else None
     return port
 
 
@@ -47,8 +48,8 @@ def test_a_computers_own_lines_are_left_out() -> None:
         listed("/dev/ttyACM0", 0x303A),
     ]
     assert usb_ports(ports) == [
-        UsbPort("/dev/ttyACM0", 0x303A, 0x7523),
-        UsbPort("/dev/ttyUSB1", 0x0403, 0x7523, "FT232R"),
+        UsbPort("/dev/ttyACM0", 0x303A, 0x7523, location="1-1.2"),
+        UsbPort("/dev/ttyUSB1", 0x0403, 0x7523, "FT232R", location="1-1.2"),
     ]
 
 
@@ -117,6 +118,22 @@ def test_a_device_that_moved_is_named_and_of_two_alike_none_is_taken(
     moved[:] = [replace(CH340, device=f"/dev/ttyUSB{number}") for number in (1, 2)]
     with pytest.raises(PortError, match="is gone"):
         port_of(CH340, "auto")
+
+
+@pytest.mark.parametrize("number", ["", "0001"])
+def test_a_board_without_its_own_serial_number_is_known_by_its_socket(
+    number: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (first,) = usb_ports([listed("/dev/ttyUSB0", 0x1A86)])
+    first = replace(first, serial_number=number, location="1-1.2")
+    now = [replace(first, device="/dev/ttyUSB3")]
+    monkeypatch.setattr(port, "found_ports", lambda: now)
+    assert port_of(first, "auto") == "/dev/ttyUSB3"
+    for device in ("/dev/ttyUSB0", "/dev/ttyUSB3"):
+        now[:] = [replace(first, device=device, location="3-4")]
+        for given in ("auto", first.device):
+            with pytest.raises(PortError, match=r"is gone.*plug the same cart in again where it was"):
+                port_of(first, given)
 
 
 def test_another_cart_is_not_driven_after_the_first_was_unplugged(monkeypatch: pytest.MonkeyPatch) -> None:
