@@ -57,6 +57,16 @@ def home(cart: SerialCart, watch: Callable[[State], None] = lambda state: None) 
             assert "ended homing" in str(error) or "is too slow" in str(error)  # noqa: PT017
 
 
+def start(cart: SerialCart) -> None:
+    """Start; again if this machine was so busy that the link seemed slow."""
+    while True:
+        try:
+            return cart.start()
+        except LinkError as error:
+            if "is too slow" not in str(error):
+                raise
+
+
 class MovedError(Exception):
     """The cart moves."""
 
@@ -70,7 +80,7 @@ def test_it_moves_when_it_homes_and_stops_when_its_host_falls_silent() -> None:
     with board() as port, SerialCart(SETTINGS.model_copy(update={"port": port})) as cart:
         assert cart.information.pole_counts_per_turn == nominal_hardware().pole_counts_per_turn
         with pytest.raises(RefusedError, match="it is not homed"):
-            cart.start()
+            start(cart)
         with pytest.raises(MovedError):
             home(cart, watch)
         while cart.flags & Flags.HOMING:
@@ -88,7 +98,7 @@ def test_it_homes_drives_and_stops_like_any_cart_and_then_drives_by_its_own_poli
         before = cart.poll_state()
         assert abs(before.cart_counts) < 100
         assert abs(before.pole_counts - 2048) <= 8
-        cart.start()
+        start(cart)
         pushed = []
         while not pushed or pushed[-1].cart_counts < FAR:
             cart.set_motor(PUSH)
