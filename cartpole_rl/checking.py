@@ -20,6 +20,7 @@ TAGS = re.compile(
 NEAR = 0.8  # similarity of two names, 0 to 1, from which one is suggested for the other
 NEAR_VALUE = 0.6  # similarity from which a value is suggested
 SAME_GROUP = 0.15  # added to the similarity within one group
+NAMELESS = "pole: the numbers of a pole stand under its name: choices: {mine: {pole_mass: ...}}"
 EXAMPLES = {  # of required settings
     "run": "run=runs/train/<run> or run=pretrained/medium",
     "format": "format=weights, onnx, c, web, firmware, minari or mcap",
@@ -68,11 +69,13 @@ def validated(
         return schema(**values)
     except ValidationError as error:
         complaints: dict[str, str] = {}
-        wrong = tuple(_key(detail) for detail in error.errors() if detail["type"] == "extra_forbidden")
-        unknown = {name for name in setting_names(values) if name.startswith(wrong)} if wrong else set()
+        wrong = tuple(f"{_key(detail)}." for detail in error.errors() if detail["type"] == "extra_forbidden")
+        unknown = {name for name in setting_names(values) if f"{name}.".startswith(wrong)}
         for detail in error.errors():
             key = _key(detail)
-            if key in complaints:  # another member of a union
+            if key.startswith("pole.pole_"):
+                complaints["pole.pole_"] = f"{source(key)}{NAMELESS}"
+            elif key in complaints:  # another member of a union
                 complaints[key] += f", or {_reason(detail).removeprefix('give ')}"
             else:
                 complaints[key] = f"{source(key)}{_complaint(detail, schema, values, unknown)}"
@@ -90,8 +93,6 @@ def _complaint(
     key = _key(detail)
     match detail["type"]:
         case "extra_forbidden":
-            if key.startswith("pole.pole_"):
-                return f"{key}: a pole's numbers stand under its name: choices: {{mine: {{pole_mass: ...}}}}"
             return no_such_setting(key, setting_names(values) - unknown)
         case "missing":
             return missing(key)

@@ -143,7 +143,7 @@ class CartPoleEnv(TransformedEnv):
 
     def step(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Step all carts; return `tensordict` with the outcome under "next". Nothing is checked."""
-        if not self._stands_alone or "_step" in tensordict:  # TorchRL's mask of the carts to step
+        if not self._stands_alone or "_step" in tensordict:  # TorchRL skips a step if it masks all carts
             return super().step(tensordict)
         return tensordict.set("next", self._driven(tensordict))
 
@@ -184,7 +184,8 @@ class CartPoleEnv(TransformedEnv):
 
 def checked(transform: Any) -> Any:
     """Return a transform. Raises ConfigError for a frame skip: it would measure n times the velocities."""
-    if isinstance(transform, FrameSkipTransform):
+    parts = [*transform] if isinstance(transform, Compose) else [transform]
+    if any(isinstance(part, FrameSkipTransform) for part in parts):
         raise ConfigError("FrameSkipTransform measures several periods as one; give a longer control_period")
     return transform
 

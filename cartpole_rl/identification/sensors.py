@@ -43,7 +43,8 @@ FINEST = 1e-3  # s between two delays that are tried, or a quarter of a period
 SPEED = 0.05  # m/s from which friction opposes the motion of the cart
 # of the angle, from which a fit starts: as it was told, half, double, and in other units
 SCALES = (1.0, 0.5, 2.0, np.pi / 180, 180 / np.pi, 2 * np.pi, 0.5 / np.pi)
-# widest intervals: scale of the angle, its zero in rad, scale of the position; a share of over 1
+# widest intervals of the angle's scale, of its zero in rad, and of the position's scale; a scale over 1
+# may have one that is as much wider
 WIDEST = 0.2, 0.1, 0.5
 FAR_BETTER = 0.5  # share of the unexplained at which another scale is taken for the right one
 OUTLIER = 3.0  # residuals, in median sizes, from which one counts less
@@ -216,8 +217,8 @@ def question_sensors(
     if samples.moves and samples.swings:
         found = angle_estimates(samples, dice, on_step)
         known = (
-            each.high - each.low < widest * max(1.0, abs(each.value))
-            for each, widest in zip(found, WIDEST, strict=True)
+            each.high - each.low < widest * max(1.0, abs(size))
+            for each, widest, size in zip(found, WIDEST, (found[0].value, 1, found[2].value), strict=True)
         )
         scale, zero, position = (each if sure else None for each, sure in zip(found, known, strict=True))
         scale, position = (each if each and each.low > 0 else None for each in (scale, position))

@@ -4,10 +4,10 @@ import json
 import os
 import re
 from collections import Counter
-from collections.abc import Hashable, Iterable, Iterator, Mapping
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -200,27 +200,45 @@ def _outdated(run: Run) -> str:
         return "a run that it needs was made again since, with another result"
     used = run.provenance.get(AGENT_HASH)
     if used and not (run.folder / INPUTS).is_file():
-        found = {known for _, known in _agents(run)}
-        if found and used not in found:
+        found = {known for place in _places(run, [Path(run.agent)]) if (known := _hash(place))}
+        if found and used not in found and _hash(place_of_agent(run)) != used:
             return f"its agent {run.agent} has another checkpoint now; repeat it"
     return ""
 
 
 def place_of_agent(run: Run) -> Path:
     """Return where the agent of a run is: the place with its hash, or else as the run names it."""
-    used = run.provenance.get(AGENT_HASH)
-    return next((place for place, known in _agents(run) if known == used), Path(run.agent))
+    used, named = run.provenance.get(AGENT_HASH), Path(run.agent)
+    if not used:
+        return named
+    places = (*_places(run, [named]), *_places(run, _after_a_copy(named)))
+    return next((place for place in places if _hash(place) == used), named)
 
 
-def _agents(run: Run) -> Iterator[tuple[Path, str]]:
-    """Yield what may be the agent of a run, with its hash: moved and copied runs name it as before."""
-    named = Path(run.agent)
-    parts = named.parts
-    inside = Path(*parts[parts.index(RUNS) :]) if named.is_absolute() and RUNS in parts else named
-    for folder in (*run.folder.absolute().parents, Path()):
-        for place in dict.fromkeys((folder / named, folder / inside)):
-            with suppress(CheckpointError, OSError):
-                yield place, file_hash(find_agent(place))
+def _places(run: Run, names: Sequence[Path]) -> list[Path]:
+    """Return where the agent of a run may be: from here, or from a folder above the run, if it was moved."""
+    folders = (Path(), *run.folder.absolute().parents)
+    return [*dict.fromkeys(folder / name for folder in folders for name in names)]
+
+
+def _after_a_copy(named: Path) -> list[Path]:
+    """Return the ends of an absolute path that begin with a folder of runs: a copy may be elsewhere."""
+    parts = named.parts if named.is_absolute() else ()
+    return [Path(*parts[place:]) for place, part in enumerate(parts) if part == RUNS]
+
+
+def _hash(place: Path) -> str | None:
+    """Return the hash of the agent at a place; None without one."""
+    with suppress(CheckpointError, OSError):
+        file = find_agent(place)
+        about = file.stat()
+        return _hash_of(file, about.st_mtime_ns, about.st_size)
+    return None
+
+
+@cache
+def _hash_of(file: Path, changed_ns: int, size: int) -> str:
+    return file_hash(file)
 
 
 def _results(folder: Path, program: str) -> dict[str, Any]:

@@ -31,6 +31,7 @@ from cartpole_rl.reporting.runs import (
 from cartpole_rl.reporting.statistics import interquartile_mean
 from cartpole_rl.reporting.texts import SCORES, count_text
 from cartpole_rl.run_folder import (
+    AGENT_HASH,
     BASELINE,
     CART,
     COMPARISON,
@@ -69,6 +70,11 @@ class Member:
     def seed(self) -> int:
         """The seed of the training at the end of the chain."""
         return (0, *self.seeds)[-1]
+
+    @property
+    def agent_key(self) -> tuple[Any, ...]:
+        """What tells its agent from others of its group: the seeds, or the hash if they are not known."""
+        return self.seeds or (self.run.provenance.get(AGENT_HASH),)
 
     @property
     def source(self) -> str:
@@ -299,9 +305,9 @@ def results_of(sweep: Sweep, measure: str) -> Results:
 
 def _agents(kept: Sequence[Kept], measure: str, curves: Mapping[Path, Mapping[str, Curve]]) -> list[Agent]:
     """Return each agent with its evaluations; its group is the label."""
-    found: dict[tuple[str, tuple[int, ...]], dict[str, Member]] = {}
+    found: dict[tuple[str, tuple[Any, ...]], dict[str, Member]] = {}
     for member, label, evaluation in kept:
-        found.setdefault((label, member.seeds), {})[evaluation or OWN.name] = member
+        found.setdefault((label, member.agent_key), {})[evaluation or OWN.name] = member
     return [
         Agent(
             label,
@@ -310,10 +316,10 @@ def _agents(kept: Sequence[Kept], measure: str, curves: Mapping[Path, Mapping[st
             {name: value for each, member in own.items() for name, value in _values(each, member, measure)},
             curves[first.run.folder],
             folders={each: member.run.folder.as_posix() for each, member in own.items()},
-            seeds=seeds,
+            seeds=first.seeds,
             source=first.source,
         )
-        for (label, seeds), own in found.items()
+        for (label, _), own in found.items()
         for first in [next(iter(own.values()))]
     ]
 
@@ -335,14 +341,14 @@ def _ordered(agents: Sequence[Agent]) -> tuple[list[Group], list[Agent]]:
 
 def without_repetitions(sweep: Sweep) -> tuple[list[Kept], list[Exclusion]]:
     """Return the members with their labels and evaluations without second runs of a seed, and those runs."""
-    kept: dict[tuple[str, str, tuple[int, ...]], Kept] = {}
+    kept: dict[tuple[str, str, tuple[Any, ...]], Kept] = {}
     repeated = []
     for member, label, evaluation in zip(sweep.members, sweep.labels, sweep.evaluations, strict=True):
-        if (label, evaluation, member.seeds) in kept:
+        if (label, evaluation, member.agent_key) in kept:
             which = f"seed {seeds_text(member.seeds)}" if member.seeds else "the agent"
             repeated.append(_exclusion(member.run, f"{which} of {label} is there twice"))
         else:
-            kept[label, evaluation, member.seeds] = member, label, evaluation
+            kept[label, evaluation, member.agent_key] = member, label, evaluation
     return [*kept.values()], repeated
 
 
@@ -410,7 +416,8 @@ def _chain(run: Run, agents: dict[Path, Run]) -> list[Run]:
         if folder not in agents and folder.is_dir():
             agents[folder] = read_run(folder)
         found = agents.get(folder)
-        if not found or not found.config or found in (run, *chain):
+        known = {os.path.realpath(each.folder) for each in (run, *chain)}
+        if not found or not found.config or os.path.realpath(found.folder) in known:
             break
         chain.append(found)
         last = found

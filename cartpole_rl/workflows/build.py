@@ -166,6 +166,8 @@ def check_plain_layers(agent: ExportedAgent, trained: TrainedAgent) -> None:
     """Raise ConfigError if the plain layers choose otherwise than the policy, as with another activation."""
     observation = torch.randn(256, agent.description.sizes[0], generator=torch.Generator().manual_seed(0))
     chosen = trained.policy(tensordict_of({"observation": observation}))
+    if "action_value" not in chosen:
+        raise ConfigError("run: its greedy policy gives no `action_value`, so it cannot be exported")
     values, found = chosen["action_value"].double().numpy(), agent.values(observation.double().numpy())
     tolerance = 1e-3 * (1 + np.abs(values).max())
     best = np.take_along_axis(values, chosen["action"].numpy()[:, None], 1)[:, 0]

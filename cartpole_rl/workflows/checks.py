@@ -102,7 +102,7 @@ def check_evaluation(config: EvaluateConfig, words: Sequence[str]) -> None:
             f"run={config.run}: only a trained agent can drive on the board; give its run folder"
         )
     config.plant.check()
-    check_stated_pole(config.pole, config)
+    check_stated_pole(config.pole, config, "leave plant.pole_length or pole= out, or mend one of them")
     check_parameters(config.parameters or {})
     if config.animation.mp4:
         check_installed("animation.mp4=true", "video")
@@ -219,15 +219,20 @@ def check_identification(config: IdentifyConfig) -> None:
     elif config.plant.reads_emulator:
         check_emulated_pole(config)
     else:
-        check_stated_pole(config.pole, config)
+        check_stated_pole(
+            config.pole, config, "give the pole on the cart as pole=, or mend plant.pole_length"
+        )
 
 
-def check_stated_pole(pole: PoleSettings | None, config: EvaluateConfig | IdentifyConfig) -> None:
-    """Raise ConfigError if pole= and plant.pole_length state two poles on a real cart."""
+def check_stated_pole(
+    pole: PoleSettings | None, config: EvaluateConfig | IdentifyConfig, remedy: str
+) -> None:
+    """Raise ConfigError, with a remedy, if pole= and plant.pole_length state two poles on a real cart."""
     length = None if config.plant.reads_emulator else config.plant.known_pole_length(config.emulator)
     if pole is not None and length is not None and not pole.includes(Pole.rod(length)):
         raise ConfigError(
-            f"plant.pole_length={length:g}: pole= states {lengths(pole)}; leave one of them out, or mend it"
+            f"plant.pole_length={length:g}: pole={pole.name} has the centre of mass of a rod of "
+            f"{lengths(pole)}; {remedy}"
         )
 
 

@@ -213,8 +213,8 @@ def doubts(reports: Sequence[Report], sensors: Sensors, period: float, layout: L
     unknown = sum(each.left_out.get(UNKNOWN, 0) for each in reports)
     if unknown > LACKING * rows:
         yield (
-            f"{unknown} of {rows} rows were left out, {UNKNOWN}: of a column that is written less often than "
-            "the others, repeat the last value"
+            f"{unknown} of {rows} rows were left out, {UNKNOWN}: if a column is written less often than the "
+            "others, repeat its last value"
         )
     if beyond := sum(each.beyond for each in reports):
         full = f"layout.motor.full={layout.motor.full:g}"
@@ -396,7 +396,9 @@ def print_summary(
         if estimate is not None:
             value, low, high = (factor * each for each in estimate)
             print(f"{name}: {value:.4g}{unit} (95 %: {low:.4g} to {high:.4g})")
-    if not (sensors.angle_scale or sensors.position_scale or sensors.delay):
+    told = sensors.angle_scale or sensors.position_scale or sensors.delay
+    misread = wrong_wrap(reports, config.layout) or angle_leaps(reports, period)
+    if not told and not misread and SHORTEST_PERIOD <= period <= LONGEST_PERIOD:
         print("the recordings are too short, or show too little motion, to question their sensors")
     for doubt in found:
         print(f"doubt: {doubt}")

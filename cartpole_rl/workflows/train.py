@@ -37,7 +37,6 @@ from cartpole_rl.workflows.poles import emulated_words, words_of_run
 
 ROUNDING = 1e-6  # share: that of float32
 FALLEN = 0.9  # of the best score: a training that ends below it says so
-ROUNDING = 1e-6  # m
 LEAST = 10.0  # score of an agent that has learned something
 
 
@@ -164,7 +163,7 @@ def note_blocked_track(config: TrainConfig) -> None:
         config.nominal_cart["track_half_length"],
         config.hardware.half_span - config.hardware.soft_limit,
     )
-    if end > soft + ROUNDING:
+    if end > soft * (1 + ROUNDING):
         print_message(
             "train",
             f"note: cart.track_half_length is {end:g} m, and from the soft limit at {soft:g} m on "

@@ -83,11 +83,10 @@ def test_a_cart_file_names_what_is_wrong_with_it(text: str, complaint: str, tmp_
 def test_a_pole_file_without_a_name_is_told_the_form(tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text("pole_mass: 0.05\npole_com: 0.2\npole_inertia: 6.7e-4\n")
     done = in_process("train", "pole=mine.yaml", folder=tmp_path)
-    form = (
-        "mine.yaml: pole.pole_mass: a pole's numbers stand under its name: choices: {mine: {pole_mass: ...}}"
-    )
-    assert done.complaint.startswith(f"cartpole-train: {form}; ")
+    form = "mine.yaml: pole: the numbers of a pole stand under its name: choices: {mine: {pole_mass: ...}}"
+    assert form in done.complaint
     assert "did you mean" not in done.complaint
+    assert done.complaint.count(form) == 1
 
 
 @pytest.mark.parametrize("command", ["finetune", "distill"])
@@ -156,8 +155,8 @@ WRONG_EVALUATION = [
     ("run=run plant=serial", "plant.port is missing", "give plant.port=/dev/ttyUSB0", 2),
     (
         "run=run plant=serial plant.port=x pole=medium plant.pole_length=0.66",
-        "plant.pole_length=0.66: pole= states 0.36 m",
-        "leave one of them out",
+        "plant.pole_length=0.66: pole=medium has the centre of mass of a rod of 0.36 m",
+        "leave plant.pole_length or pole= out",
         2,
     ),
     ("run=run plant=serial plant.port=nowhere", "nowhere does not exist", "plug the cart in", 1),

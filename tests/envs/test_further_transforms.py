@@ -4,7 +4,15 @@ from collections.abc import Callable
 
 import pytest
 from courses import course
-from torchrl.envs import CatFrames, FrameSkipTransform, InitTracker, RewardSum, Transform, TransformedEnv
+from torchrl.envs import (
+    CatFrames,
+    Compose,
+    FrameSkipTransform,
+    InitTracker,
+    RewardSum,
+    Transform,
+    TransformedEnv,
+)
 from torchrl.envs.utils import check_env_specs
 
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
@@ -39,5 +47,6 @@ def test_an_appended_transform_gives_what_a_nested_environment_gives(
 def test_a_frame_skip_is_refused(simulated: Callable[..., CartPoleEnv]) -> None:
     env = simulated(4)
     for add in (env.append_transform, lambda transform: env.insert_transform(0, transform)):
-        with pytest.raises(ConfigError, match="give a longer control_period"):
-            add(FrameSkipTransform(3))
+        for skip in (FrameSkipTransform(3), Compose(RewardSum(), FrameSkipTransform(3))):
+            with pytest.raises(ConfigError, match="give a longer control_period"):
+                add(skip)

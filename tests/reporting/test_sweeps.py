@@ -183,6 +183,20 @@ def test_an_agent_is_found_by_its_hash_from_anywhere(
     shutil.rmtree("runs")
     (member,) = read_sweep("runs", [str(home)], MEASURE).members
     assert (member.agent, member.seeds) == (None, ())  # the seed of the evaluation is not the agent's
+    shutil.copytree(home, home.parent / "second")
+    edit(home.parent / "second/provenance.json", lambda content: content.update(agent_sha256="of another"))
+    (lost,), _ = grouped([read_sweep("runs", [str(home), str(home.parent / "second")], MEASURE)])
+    assert len(results_of(lost, MEASURE).agents) == 2  # by their hashes
+
+
+def test_an_unrelated_agent_of_the_same_name_condemns_no_copied_run(study: Path, edit: Edit) -> None:
+    heavy, other = study / "much/10/evaluations/heavy", Path("runs/first/checkpoints/last.pt")
+    other.parent.mkdir(parents=True)
+    other.write_bytes(b"of this project")
+    edit(heavy / "config.yaml", lambda content: content.update(run="/elsewhere/runs/first"))
+    edit(heavy / "provenance.json", lambda content: content.update(agent_sha256="of another"))
+    (member,) = read_sweep("runs", [str(heavy)], MEASURE).members
+    assert (member.agent, member.problem) == (None, "")
 
 
 def test_versions_and_commands_are_compared_over_both_sets(study: Path, edit: Edit) -> None:

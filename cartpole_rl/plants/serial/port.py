@@ -112,8 +112,8 @@ def resolved_port(port: str) -> str:
 def port_of(earlier: UsbPort, port: str) -> str:
     """Return where the device `earlier` is now that was at `port`. Raises PortError if another one is there.
 
-    A device may get another path when it is plugged in again; of several without a serial number none is
-    taken for it.
+    A device may get another path when it is plugged in again. One without a serial number of its own is known
+    by its socket; where that is not known either, none of several is taken for it.
     """
     ports = found_ports()
     paths = [each.device for each in ports if each.identity == earlier.identity]
