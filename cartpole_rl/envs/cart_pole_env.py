@@ -135,11 +135,11 @@ class CartPoleEnv(TransformedEnv):
 
     def append_transform(self, transform: Any, *arguments: Any, **named: Any) -> EnvBase:
         """Append a transform. Raises ConfigError for one that steps several times on the same counts."""
-        return super().append_transform(checked(transform), *arguments, **named)
+        return super().append_transform(without_frame_skip(transform), *arguments, **named)
 
     def insert_transform(self, index: int, transform: Any) -> EnvBase:
         """Insert a transform. Raises ConfigError as `append_transform`."""
-        return super().insert_transform(index, checked(transform))
+        return super().insert_transform(index, without_frame_skip(transform))
 
     def step(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Step all carts; return `tensordict` with the outcome under "next". Nothing is checked."""
@@ -182,7 +182,7 @@ class CartPoleEnv(TransformedEnv):
         return self.hardware.perceive(tensordict, command, self.plant._step(command))
 
 
-def checked(transform: Any) -> Any:
+def without_frame_skip(transform: Any) -> Any:
     """Return a transform. Raises ConfigError for a frame skip: it would measure n times the velocities."""
     parts = [*transform] if isinstance(transform, Compose) else [transform]
     if any(isinstance(part, FrameSkipTransform) for part in parts):

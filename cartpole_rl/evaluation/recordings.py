@@ -17,6 +17,7 @@ from cartpole_rl.errors import ConfigError, RecordingError
 from cartpole_rl.files import replacing
 from cartpole_rl.rig.hardware import LARGEST_MOTOR, Encoders, hardware_of
 from cartpole_rl.tasks.episode import Ending, Episode, Origin
+from cartpole_rl.wire.messages import MOST_COUNTS
 
 FORMAT = "cartpole_rl recording 1"
 STATE = {  # column: field of Episode
@@ -28,7 +29,6 @@ STATE = {  # column: field of Episode
 }
 STEP = {"score": "score", "score_upright": "score_upright", "reward": "reward"}
 COUNTS = ("cart_counts", "pole_counts")
-FEWEST_COUNTS, MOST_COUNTS = -(2**31), 2**31 - 1  # int32 on the wire
 METRES, TURN = "cart_nanometres_per_count", "pole_counts_per_turn"  # in the heading; without them: ip02's
 BEFORE = "motor_before"  # in the heading of a part of a log: its motor values before the first row
 LENGTH = "pole_length_m"  # in the heading: twice pivot to centre of mass, empty if not known
@@ -212,7 +212,7 @@ def _check_numbers(
         raise damaged(int(np.flatnonzero(~steps)[0]) + 1, "the time does not increase")
     if (beyond := (motor < -LARGEST_MOTOR) | (motor > LARGEST_MOTOR)).any():
         raise damaged(int(np.flatnonzero(beyond)[0]), f"a motor value is beyond {LARGEST_MOTOR}")
-    if (beyond := (counts < FEWEST_COUNTS) | (counts > MOST_COUNTS)).any():
+    if (beyond := (counts < -MOST_COUNTS - 1) | (counts > MOST_COUNTS)).any():
         raise damaged(int(np.flatnonzero(beyond.any(axis=1))[0]), f"a count is beyond {MOST_COUNTS}")
 
 

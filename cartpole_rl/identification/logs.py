@@ -23,6 +23,7 @@ from cartpole_rl.identification.settings import Direction, Layout, TimeColumn
 from cartpole_rl.identification.windows import UNEVEN, history_periods, mean_gap
 from cartpole_rl.rig.hardware import LARGEST_MOTOR, Encoders
 from cartpole_rl.tasks.episode import Ending, Episode
+from cartpole_rl.wire.messages import MOST_COUNTS
 
 Array = NDArray[np.float64]
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
@@ -33,7 +34,6 @@ LEAP, SMALL_LEAP = 0.25, 0.05  # turns beside whole ones between two rows; the l
 FEW, LEAST_JUMPS = 50, 3  # values of a column that does not turn; jumps that tell where it wraps
 MOST_OF_RANGE, ALIKE = 0.8, 0.02  # shares of a column's range, and of a jump by which others may differ
 TURNING, STALE = 0.05 / (2 * np.pi), 1 / 3  # turns in three rows; share of such rows that repeat their states
-MOST_COUNTS = 2**31 - 1  # of an encoder, as in recordings
 NUMBERS = re.compile(r"(?=.*\d)([-+.,;:|\s\dEe]|nan|inf)+", re.IGNORECASE)  # a row of them
 SLACK = 1e-6  # s, of sums of times
 FINEST = 0.01  # share of the time between rows: with a shorter period a wrong unit would fill the memory
@@ -126,7 +126,7 @@ def cut_log(read: Rows, layout: Layout, encoders: Encoders, period: float) -> Lo
     jitter = float(np.quantile(np.abs(gaps - period), 0.95)) if len(gaps) else 0.0
     x = signed(layout.position.positive) * (columns[layout.position.name] - layout.position.zero)
     x *= METRES[layout.position.unit] if isinstance(layout.position.unit, str) else layout.position.unit
-    turn = TURN[layout.angle.unit] if isinstance(layout.angle.unit, str) else layout.angle.unit
+    turn = units_of_turn(layout)
     angle = columns[layout.angle.name]
     if not isinstance(layout.angle.wraps, bool):
         angle = np.unwrap(angle, period=layout.angle.wraps)
@@ -195,6 +195,12 @@ def cut_log(read: Rows, layout: Layout, encoders: Encoders, period: float) -> Lo
         jitter,
     )
     return Log(parts, report)
+
+
+def units_of_turn(layout: Layout) -> float:
+    """Return how many units of the angle's column a turn has, by the layout."""
+    unit = layout.angle.unit
+    return TURN[unit] if isinstance(unit, str) else unit
 
 
 def wrap_of(angle: Array, together: NDArray[np.bool_]) -> float:

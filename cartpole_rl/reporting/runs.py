@@ -200,8 +200,8 @@ def _outdated(run: Run) -> str:
         return "a run that it needs was made again since, with another result"
     used = run.provenance.get(AGENT_HASH)
     if used and not (run.folder / INPUTS).is_file():
-        found = {known for place in _places(run, [Path(run.agent)]) if (known := _hash(place))}
-        if found and used not in found and _hash(place_of_agent(run)) != used:
+        is_there = any(map(_hash, _places(run, [Path(run.agent)])))
+        if is_there and _hash(place_of_agent(run)) != used:
             return f"its agent {run.agent} has another checkpoint now; repeat it"
     return ""
 

@@ -14,6 +14,7 @@ from typing import ClassVar, Self
 from cartpole_rl.errors import FrameError
 
 FROM_CART = 0x80  # the bit of a type byte that is set in frames from the cart
+MOST_COUNTS = 2**31 - 1  # of an encoder, in a STATE
 
 
 class MessageType(IntEnum):

@@ -30,6 +30,7 @@ from cartpole_rl.identification.logs import (
     Rows,
     cut_log,
     read_rows,
+    units_of_turn,
 )
 from cartpole_rl.identification.sensors import Estimate, Sensors, question_sensors
 from cartpole_rl.identification.settings import ImportConfig, Layout, log_files
@@ -98,8 +99,8 @@ def import_logs(config: ImportConfig, folder: Path) -> Sensors | None:
     with progress_bar(None, "steps", desc="sensors") as bar:
         taken = parts if SHORTEST_PERIOD <= period <= LONGEST_PERIOD else []  # at 1 kHz it takes minutes
         sensors = question_sensors(motions(taken), period, on_step=bar.update)
-    # then the angle tells nothing, and nor does what is estimated with it
-    if wrong_wrap(reports, config.layout) or angle_leaps(reports, period):
+    misread = wrong_wrap(reports, config.layout) or angle_leaps(reports, period)
+    if misread:  # then the angle tells nothing, and nor does what is estimated with it
         sensors = Sensors(None, None, None, None, None, sensors.push, 0.0)
     found = [*doubts(reports, sensors, period, config.layout)]
     write_config(folder, "import", {**config.model_dump(mode="json", by_alias=True), "seed": 0})
@@ -111,7 +112,7 @@ def import_logs(config: ImportConfig, folder: Path) -> Sensors | None:
             place = folder / RECORDINGS / f"{name}_{number:02d}.csv"
             write_recording(place, part, {**heading, "log": path.name})
     write_json(folder / IMPORTED, summary(logs, sensors, found))
-    print_summary(logs, parts, period, sensors, found, folder, config)
+    print_summary(logs, parts, period, sensors, bool(taken) and not misread, found, folder, config)
     return sensors
 
 
@@ -244,12 +245,6 @@ def angle_jump(reports: Sequence[Report], layout: Layout) -> float:
     return next((size for size in likely if abs(jump / size - 1) < WRAP), jump)
 
 
-def units_of_turn(layout: Layout) -> float:
-    """Return how many units of the angle's column a turn has, by the layout."""
-    unit = layout.angle.unit
-    return TURN[unit] if isinstance(unit, str) else unit
-
-
 def wrong_wrap(reports: Sequence[Report], layout: Layout) -> str:
     """Return a sentence if the angle jumps by other than whole turns."""
     jump, turn, name = angle_jump(reports, layout), units_of_turn(layout), layout.angle.name
@@ -371,6 +366,7 @@ def print_summary(
     parts: Sequence[Any],
     period: float,
     sensors: Sensors,
+    questioned: bool,
     found: Sequence[str],
     folder: Path,
     config: ImportConfig,
@@ -396,9 +392,7 @@ def print_summary(
         if estimate is not None:
             value, low, high = (factor * each for each in estimate)
             print(f"{name}: {value:.4g}{unit} (95 %: {low:.4g} to {high:.4g})")
-    told = sensors.angle_scale or sensors.position_scale or sensors.delay
-    misread = wrong_wrap(reports, config.layout) or angle_leaps(reports, period)
-    if not told and not misread and SHORTEST_PERIOD <= period <= LONGEST_PERIOD:
+    if questioned and not (sensors.angle_scale or sensors.position_scale or sensors.delay):
         print("the recordings are too short, or show too little motion, to question their sensors")
     for doubt in found:
         print(f"doubt: {doubt}")

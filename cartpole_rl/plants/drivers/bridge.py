@@ -32,7 +32,7 @@ from cartpole_rl.plants.drivers.potentiometer import Potentiometer
 from cartpole_rl.plants.settings import BoardSettings
 from cartpole_rl.rig.hardware import Hardware
 from cartpole_rl.signals import ending_signals
-from cartpole_rl.wire.messages import Fault, Home, Message, Reason, SetPeriod, State, Stop
+from cartpole_rl.wire.messages import MOST_COUNTS, Fault, Home, Message, Reason, SetPeriod, State, Stop
 
 LISTENED = 25  # measurements by which a board's period is known
 FASTEST_BOARD_US = 200  # between two measurements; faster ones are milliseconds, taken for microseconds
@@ -40,7 +40,6 @@ LISTENED_TO_ARRIVALS = 1.0  # s for a board that does not send its time
 FEW_LOST = 3  # gaps between two measurements, in medians: in longer ones the board was not heard
 PERIOD_TOLERANCE = 0.05  # share
 SAMPLES = 3  # measurements by which the limits know the speed
-MOST_COUNTS = 2**31 - 1  # in a STATE
 LEAK = 0.01  # largest difference between the rates of the two clocks
 LATE_PERIODS = 1.5  # without a measurement, after which the rules look at the clock alone
 MOST_BAD = 50  # damaged measurements more than whole ones
