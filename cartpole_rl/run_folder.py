@@ -109,6 +109,15 @@ def recorded_provenance(folder: Path) -> dict[str, Any]:
     return recorded if isinstance(recorded, dict) else {}
 
 
+def recorded_config(folder: Path) -> dict[str, Any]:
+    """Return the config.yaml of the run in `folder`; empty if it is missing or damaged."""
+    try:
+        recorded = yaml.safe_load((folder / CONFIG).read_text(encoding="utf-8"))
+    except (OSError, ValueError, yaml.YAMLError):
+        return {}
+    return recorded if isinstance(recorded, dict) else {}
+
+
 def check_program(setting: str, folder: Path, *taken: str) -> None:
     """Raise ConfigError if `folder` is a run of a command that is not among `taken`."""
     if (folder / MULTIRUN).is_file():

@@ -80,6 +80,12 @@ def medium() -> PoleSettings:
 
 
 @pytest.fixture(scope="session")
+def nominal(ip02: dict[str, float], medium: PoleSettings) -> dict[str, float]:
+    """Nominal numbers of the cart and the medium pole."""
+    return {**ip02, **medium.nominal.model_dump()}
+
+
+@pytest.fixture(scope="session")
 def both_poles() -> PoleSettings:
     return PoleSettings(choices={**conf("pole/medium")["choices"], **conf("pole/large")["choices"]})
 

@@ -59,7 +59,6 @@ from numpy.typing import NDArray
 from cartpole_rl import MAX_EPISODE_STEPS
 from cartpole_rl.checking import nearest_choice
 from cartpole_rl.choices import choice
-from cartpole_rl.drawing.window import has_display
 from cartpole_rl.envs.settings import CartPoleSettings
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.plants.settings import SimulatedSettings
@@ -69,7 +68,7 @@ from cartpole_rl.terminal import waiting
 with waiting("starting"), no_garbage_collection():  # PyTorch and TorchRL take seconds to import
     from cartpole_rl.envs.build import shipped_settings, simulated_env, with_fitted_guard
     from cartpole_rl.envs.cart_pole_env import CartPoleEnv
-    from cartpole_rl.envs.rendering import RENDER_MODES, Picture, Renderer
+    from cartpole_rl.envs.rendering import RENDER_MODES, Picture, Renderer, has_display
 
 OF_TASK = {
     "swingup": {"task": "swingup", "actions": "nine_levels", "reward": "score"},

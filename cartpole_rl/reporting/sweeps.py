@@ -380,7 +380,8 @@ def _found(name: str, source: str) -> list[Path]:
     folders = [folder for folder in folders if folder.is_dir() or folder.is_symlink()]
     runs = [run for folder in folders for run in (find_runs(folder) if folder.is_dir() else [folder])]
     if not runs:
-        missing = "it holds no run" if folders else "there is no such folder"
+        absent = "it is a file" if Path(source).is_file() else "there is no such folder"
+        missing = "it holds no run" if folders else absent
         missing += " (in a pattern, [[] stands for a bracket)" if "[" in source and not folders else ""
         raise ConfigError(
             f"{name}={source}: {missing}; give a run folder, a folder that holds some, or a pattern"

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import torch
-import yaml
 
 from cartpole_rl.agents.baseline import EnergyAndRegulator
 from cartpole_rl.agents.own import OwnPolicy
@@ -33,10 +32,10 @@ from cartpole_rl.rig.parameters import check_names, completed
 from cartpole_rl.run_folder import (
     BASELINE,
     CHECKPOINTS,
-    CONFIG,
     find_agent,
     is_own_policy,
     program_of,
+    recorded_config,
     recorded_provenance,
 )
 from cartpole_rl.scheduling import taking_precedence
@@ -216,12 +215,10 @@ def recorded_cart(recordings: Sequence[Path]) -> CartPoleSettings | None:
     if program_of(folder) == "finetune":
         training = trained_agent(folder).training
         return CartPoleSettings(**{name: getattr(training, name) for name in CartPoleSettings.model_fields})
-    try:
-        recorded = yaml.safe_load((folder / CONFIG).read_text(encoding="utf-8")).get(RECORDED)
-    except (OSError, yaml.YAMLError, AttributeError):
+    recorded = recorded_config(folder).get(RECORDED)
+    if not recorded or program_of(folder) not in ("record", "import"):
         return None
-    known = program_of(folder) in ("record", "import") and recorded
-    return recorded_settings(CartPoleSettings, recorded, f"from={folder}") if known else None
+    return recorded_settings(CartPoleSettings, recorded, f"from={folder}")
 
 
 def evaluated_settings(training: TrainConfig, config: EvaluateConfig) -> CartPoleSettings:

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
 from tqdm import tqdm
 
 from cartpole_rl.checking import validated
@@ -29,7 +28,7 @@ from cartpole_rl.randomization.poles import Pole, PoleSettings
 from cartpole_rl.reporting.texts import guard_text
 from cartpole_rl.reporting.web_view import chosen_view
 from cartpole_rl.rig.hardware import hardware_of
-from cartpole_rl.run_folder import BASELINE, CONFIG, METRICS, check_program, is_own_policy
+from cartpole_rl.run_folder import BASELINE, METRICS, check_program, is_own_policy, recorded_config
 from cartpole_rl.tasks.episode import Episode, Origin
 from cartpole_rl.terminal import confirm, print_message, progress_bar, waiting
 from cartpole_rl.workflows.build import (
@@ -47,7 +46,7 @@ from cartpole_rl.workflows.build import (
     trained_agent,
     use_threads,
 )
-from cartpole_rl.workflows.checks import note_other_numbers, simulated_carts
+from cartpole_rl.workflows.checks import agent_file, note_other_numbers, simulated_carts
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
 from cartpole_rl.workflows.poles import other_pole
 
@@ -75,6 +74,7 @@ class Evaluation:
     known_poles: Sequence[PoleSettings]  # of the agent
     simulation: CartPoleEnv | None  # that predicts the first episode
     on_board: ExportedAgent | None  # that the cart's board should have; None if it does not drive
+    agent_content: bytes | None  # of its file, which another training may overwrite; None without one
 
     def episodes(self) -> Iterator[Episode]:
         """Drive the repeated episode, or new ones, and yield each as it ends."""
@@ -136,6 +136,8 @@ def prepared(config: EvaluateConfig) -> Evaluation:
     use_threads(config.threads)
     seed_everything(config.seed)
     agent = evaluated_agent(config)
+    file = agent_file(config.run)
+    content = file.read_bytes() if file else None
     training = compiled_training(agent) if config.plant.has_compiled_agent else agent.training
     settings = evaluated_settings(training, config)
     simulation = (
@@ -147,7 +149,16 @@ def prepared(config: EvaluateConfig) -> Evaluation:
     with on_the_board(config, agent, settings) as equipped:
         env = evaluated_env(settings, equipped, prompt=tqdm.write, confirm=confirm)
     return Evaluation(
-        config, settings, env, agent.policy, again, agent.training, agent.known_poles, simulation, on_board
+        config,
+        settings,
+        env,
+        agent.policy,
+        again,
+        agent.training,
+        agent.known_poles,
+        simulation,
+        on_board,
+        content,
     )
 
 
@@ -247,10 +258,10 @@ def read_evaluation(run: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the config and the metrics of an evaluation in simulation. Raises ConfigError."""
     check_program("repeat.run", run, "evaluate")
     try:
-        recorded = yaml.safe_load((run / CONFIG).read_text(encoding="utf-8"))
+        recorded = recorded_config(run)
         metrics = json.loads((run / METRICS).read_text(encoding="utf-8"))
         plant, _ = metrics["plant"], recorded["evaluated"]
-    except (OSError, ValueError, LookupError, TypeError, yaml.YAMLError):
+    except (OSError, ValueError, LookupError, TypeError):
         raise ConfigError(
             f"repeat.run={run}: it is not a finished run of cartpole-evaluate; give the run folder of one"
         ) from None

@@ -24,7 +24,6 @@ from cartpole_rl.run_folder import (
 )
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.terminal import as_word, print_loop_time, print_results, shown, words_given
-from cartpole_rl.workflows.checks import agent_file
 from cartpole_rl.workflows.config import EvaluateConfig
 from cartpole_rl.workflows.episodes import Evaluation, Repetition, prepared
 from cartpole_rl.workflows.poles import POLES, emulated_words, emulator_for, plant_words
@@ -46,7 +45,7 @@ def evaluate(config: EvaluateConfig, folder: Path) -> None:
             evaluation.check_board()
             settings = evaluation.settings.model_dump(mode="json")
             content = {**evaluation.config.model_dump(mode="json"), "evaluated": settings}
-            write_config(folder, "evaluate", content, agent=agent_file(config.run))
+            write_config(folder, "evaluate", content, agent=evaluation.agent_content)
             for episode in evaluation.episodes():
                 episodes.append(episode)
             if config.drives_on_board:

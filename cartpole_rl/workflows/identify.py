@@ -49,7 +49,6 @@ from cartpole_rl.rig.hardware import Hardware
 from cartpole_rl.rig.parameters import PARAMETERS
 from cartpole_rl.run_folder import (
     CART,
-    CONFIG,
     FIGURES,
     IDENTIFIED,
     PAGE,
@@ -59,6 +58,7 @@ from cartpole_rl.run_folder import (
     RECORDINGS,
     experiments,
     program_of,
+    recorded_config,
     write_config,
     write_json,
 )
@@ -420,15 +420,6 @@ def known_truth(config: IdentifyConfig) -> EmulatorSettings | None:
         return truth.of_cart(recorded["cart"]) if of_emulator else None
     except (LookupError, TypeError, ConfigError):  # recordings of another origin
         return None
-
-
-def recorded_config(run: Path) -> dict[str, Any]:
-    """Return the content of config.yaml in a run folder; empty if it is missing or damaged."""
-    try:
-        recorded = yaml.safe_load((run / CONFIG).read_text(encoding="utf-8"))
-    except (OSError, ValueError, yaml.YAMLError):
-        return {}
-    return recorded if isinstance(recorded, dict) else {}
 
 
 def errors(

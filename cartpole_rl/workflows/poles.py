@@ -5,7 +5,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import yaml
 from pydantic import Field, TypeAdapter
 
 from cartpole_rl.choices import choice, group_choices
@@ -13,7 +12,7 @@ from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.plants.settings import PlantSettings, PortSettings, changed_words, emulated_pole
 from cartpole_rl.randomization.poles import HEAVIER, Pole, PoleSettings, check_one_pole, one_pole
-from cartpole_rl.run_folder import CONFIG
+from cartpole_rl.run_folder import recorded_config
 
 if TYPE_CHECKING:
     from cartpole_rl.evaluation.recordings import Recording  # imports PyTorch
@@ -101,13 +100,13 @@ def plant_words(
 
 def words_of_run(folder: Path) -> str | None:
     """Return the words of the cart that the recordings of a run in `folder` are of; None if it is unknown."""
+    content = recorded_config(folder)
     try:
-        content = yaml.safe_load((folder / CONFIG).read_text(encoding="utf-8"))
         if content.get("from"):
             return words_of_run(Path(content["from"]))
         plant = TypeAdapter(Annotated[PortSettings, Field(discriminator="kind")])
         return plant_words(plant.validate_python(content["plant"]), EmulatorSettings(**content["emulator"]))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, yaml.YAMLError):
+    except (ValueError, KeyError, TypeError):
         return None
 
 

@@ -17,7 +17,6 @@ from cartpole_rl.run_folder import RECORDINGS, write_config
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.terminal import as_word, shown
 from cartpole_rl.workflows.build import RECORDED
-from cartpole_rl.workflows.checks import agent_file
 from cartpole_rl.workflows.config import EvaluateConfig, RecordConfig
 from cartpole_rl.workflows.episodes import Evaluation, prepared
 
@@ -35,7 +34,7 @@ def record(config: RecordConfig, folder: Path) -> None:
             evaluation.print_notes("record")
             settings = agents_settings(evaluation).model_dump(mode="json")
             content = {**evaluation.config.model_dump(mode="json"), RECORDED: settings}
-            write_config(folder, "record", content, agent=agent_file(evaluation.config.run))
+            write_config(folder, "record", content, agent=evaluation.agent_content)
             for episode in evaluation.episodes():
                 path = folder / RECORDINGS / f"episode_{len(episodes):03d}.csv"
                 episodes[path] = episode

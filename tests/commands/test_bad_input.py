@@ -1,11 +1,9 @@
 """Each kind of wrong input gives one line with its remedy, before any work and without a traceback."""
 
-import os
 import shutil
 from pathlib import Path
 
 import pytest
-import serial
 import torch
 from command_line import ONCE, TINY, Outcome, console_script, in_process, outcome
 
@@ -192,30 +190,6 @@ def test_evaluation(words: str, named: str, remedy: str, code: int, files: Path)
     assert done.code == code
     assert done.out == ""
     assert not (files / "runs/evaluate").exists()
-
-
-@pytest.fixture
-def port() -> str:
-    """A serial port without a cart."""
-    host, device = os.openpty()
-    yield os.ttyname(device)
-    os.close(host)
-    os.close(device)
-
-
-def test_a_port_that_another_program_has_open(port: str, files: Path) -> None:
-    with serial.Serial(port, exclusive=True):
-        done = in_process("evaluate", "run=run", "plant=serial", f"plant.port={port}", folder=files)
-    assert f"{port} is busy" in done.complaint
-    assert done.code == 1
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may open everything")
-def test_a_port_that_may_not_be_opened(port: str, files: Path) -> None:
-    Path(port).chmod(0)
-    done = in_process("evaluate", "run=run", "plant=serial", f"plant.port={port}", folder=files)
-    assert "dialout" in done.complaint
-    assert done.code == 1
 
 
 @pytest.mark.parametrize("command", ["finetune", "identify", "preflight"])

@@ -71,8 +71,8 @@ def shaken(env: CartPoleEnv, seed: int) -> list[Episode]:
 
 
 @pytest.fixture(scope="module")
-def parameters(ip02: dict[str, float], medium: PoleSettings) -> dict[str, float]:
-    return {**ip02, **medium.nominal.model_dump(), **TRACK}
+def parameters(nominal: dict[str, float]) -> dict[str, float]:
+    return {**nominal, **TRACK}
 
 
 @pytest.fixture(scope="module")

@@ -40,7 +40,6 @@ from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.serial.plant import emulated_plant
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.plants.specs import Numbers, OneCartPlant, PlantOutput
-from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.rig.hardware import (
     Hardware,
     hardware_of,
@@ -91,11 +90,6 @@ def recordings(make_plant: Callable[..., SimulatedPlant]) -> dict[str, Episode]:
     plant = make_plant(1, cart=TRUTH, models=MODELS, start=HANGING)
     shorter = tuple(each._replace(moves=SHORTER.get(each.name, each.moves)) for each in EXPERIMENTS)
     return {each.name: episode for each, episode in conduct(plant, PERIOD, experiments=shorter)}
-
-
-@pytest.fixture(scope="module")
-def nominal(ip02: dict[str, float], medium: PoleSettings) -> dict[str, float]:
-    return {**ip02, **medium.nominal.model_dump()}
 
 
 @pytest.fixture(scope="module")

@@ -73,11 +73,6 @@ def episodes(make_plant: MakePlant, make_environment: MakeEnvironment) -> list[E
     return run_batch(env, shake)  # type: ignore[arg-type]
 
 
-@pytest.fixture(scope="module")
-def nominal(ip02: dict[str, float], medium: PoleSettings) -> dict[str, float]:
-    return {**ip02, **medium.nominal.model_dump()}
-
-
 def test_the_true_cart_predicts_every_count(episodes: list[Episode], nominal: dict[str, float]) -> None:
     """From the true initial state at rest, to the rounding of the encoders."""
     first = episodes[0]
@@ -258,10 +253,9 @@ def test_every_fifth_is_held_out_or_the_last_fifth_of_a_few() -> None:
 
 @pytest.mark.parametrize(("point", "said"), [(0.2, "hardly show cart_mass"), (9.0, "cart_mass = ")])
 def test_a_parameter_is_unusual_or_not_shown_but_not_both(
-    ip02: dict[str, float], medium: PoleSettings, point: float, said: str
+    nominal: dict[str, float], point: float, said: str
 ) -> None:
     mass = next(each for each in unknowns() if each.name == "cart_mass")
-    nominal = {**ip02, **medium.nominal.model_dump()}
     fit = Fit([mass], np.array([point]), np.array([[0.9]]), nominal, np.zeros(2), np.zeros(2), 1.0)
     (warning,) = warnings(fit, nominal_encoders())
     assert said in warning

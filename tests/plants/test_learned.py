@@ -28,26 +28,21 @@ CARTS = 6
 MakeLearned = Callable[..., LearnedPlant]
 
 
-def learned_model(parameters: dict[str, float], size: float) -> LearnedModel:
+def learned_model(nominal: dict[str, float], size: float) -> LearnedModel:
     generator = torch.Generator().manual_seed(0)
     drawn = Residual.untrained(3, 8, generator, 0.02, 4.0, 0.814)
     residual = drawn._replace(
         places=size * torch.randn(3, PLACES, generator=generator),
         last=size * torch.randn(3, 2, 8, generator=generator),
     )
-    return LearnedModel(parameters, STEP, 0.02, 4, residual)
+    return LearnedModel(nominal, STEP, 0.02, 4, residual)
 
 
 @pytest.fixture(scope="module")
-def parameters(ip02: dict[str, float], medium: PoleSettings) -> dict[str, float]:
-    return {**ip02, **medium.nominal.model_dump()}
-
-
-@pytest.fixture(scope="module")
-def make_learned(ip02: dict[str, float], medium: PoleSettings, parameters: dict[str, float]) -> MakeLearned:
+def make_learned(ip02: dict[str, float], medium: PoleSettings, nominal: dict[str, float]) -> MakeLearned:
     def build(size: float = 0.5, **settings: bool | int) -> LearnedPlant:
         randomizer = Randomizer(ip02, medium, {})
-        return LearnedPlant(CARTS, learned_model(parameters, size), randomizer, START, **settings)
+        return LearnedPlant(CARTS, learned_model(nominal, size), randomizer, START, **settings)
 
     return build
 
@@ -130,29 +125,29 @@ def test_a_snapshot_goes_on_as_if_nothing_had_happened(make_learned: MakeLearned
 
 
 class TestFile:
-    def test_it_comes_back(self, parameters: dict[str, float], tmp_path: Path) -> None:
-        model = learned_model(parameters, 0.5)
+    def test_it_comes_back(self, nominal: dict[str, float], tmp_path: Path) -> None:
+        model = learned_model(nominal, 0.5)
         save_model(tmp_path / "model.pt", model)
         for source in (tmp_path, tmp_path / "model.pt"):
             read = load_model(source)
             assert (dict(read.parameters), read.models, read.period, read.substeps) == (
-                parameters,
+                nominal,
                 STEP,
                 0.02,
                 4,
             )
             assert all(map(torch.equal, read.residual, model.residual))
-        assert list(read.parameters) == list(parameters)
+        assert list(read.parameters) == list(nominal)
         assert set(read.parameters) == set(CartParameters.names())
 
-    def test_one_that_cannot_be_written_is_named(self, parameters: dict[str, float], tmp_path: Path) -> None:
+    def test_one_that_cannot_be_written_is_named(self, nominal: dict[str, float], tmp_path: Path) -> None:
         path = tmp_path / "model.pt"
         with files_of_at_most(1024), pytest.raises(OSError, match="File too large") as caught:
-            save_model(path, learned_model(parameters, 0.5))
+            save_model(path, learned_model(nominal, 0.5))
         assert caught.value.filename == str(path)
         assert not list(tmp_path.iterdir())
 
-    def test_what_is_no_model_is_named(self, parameters: dict[str, float], tmp_path: Path) -> None:
+    def test_what_is_no_model_is_named(self, nominal: dict[str, float], tmp_path: Path) -> None:
         def complaint(source: Path) -> str:
             with pytest.raises(CheckpointError) as error:
                 load_model(source)
@@ -161,7 +156,7 @@ class TestFile:
         assert complaint(tmp_path) == "plant.model=: it holds no model.pt; give a run of cartpole-model"
         assert complaint(tmp_path / "a.pt").startswith("plant.model=/a.pt: there is no such file or folder")
         whole = tmp_path / "whole.pt"
-        save_model(whole, learned_model(parameters, 0.5))
+        save_model(whole, learned_model(nominal, 0.5))
         (tmp_path / "cut.pt").write_bytes(whole.read_bytes()[:2000])
         assert "cut.pt is not a learned model, or is damaged" in complaint(tmp_path / "cut.pt")
         torch.save({"format": "cartpole_rl agent 1"}, tmp_path / "agent.pt")

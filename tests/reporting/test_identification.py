@@ -15,7 +15,6 @@ from cartpole_rl.physics.friction import CART_FRICTIONS
 from cartpole_rl.physics.laws import Law
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
-from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.reporting.identification import (
     CAPTIONS,
     experiments_figure,
@@ -80,8 +79,8 @@ NAMES = CartParameters.names()
 
 
 @pytest.fixture(scope="module")
-def prior(ip02: dict[str, float], medium: PoleSettings) -> dict[str, float]:
-    return {**ip02, **medium.nominal.model_dump(), "cart_coulomb_asymmetry": 0.0}
+def prior(nominal: dict[str, float]) -> dict[str, float]:
+    return {**nominal, "cart_coulomb_asymmetry": 0.0}
 
 
 def samples(prior: dict[str, float], **changes: tuple[float, ...]) -> np.ndarray:

@@ -12,7 +12,7 @@ from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.unknowns import WEIGHED, unknowns_of
 from cartpole_rl.physics.friction import CART_FRICTIONS, COULOMB, stribeck_force
 from cartpole_rl.physics.models import Models
-from cartpole_rl.randomization.poles import Pole, PoleSettings
+from cartpole_rl.randomization.poles import Pole
 from cartpole_rl.rig.hardware import nominal_hardware
 from cartpole_rl.rig.parameters import POSITIVE, Parameter, factor
 from cartpole_rl.workflows.identify import friction_choice, write_choices
@@ -31,11 +31,6 @@ def write(models: Models, nominal: dict[str, float], folder: Path) -> dict[str, 
     write_choices(found, fit.draw(10, np.random.default_rng(0)), folder, HARDWARE)
     of_cart = {name: value for name, value in fit.parameters.items() if name not in Pole.model_fields}
     return {**of_cart, **HARDWARE.model_dump()}
-
-
-@pytest.fixture
-def nominal(ip02: dict[str, float], medium: PoleSettings) -> dict[str, float]:
-    return {**ip02, **medium.nominal.model_dump()}
 
 
 def test_the_cart_has_every_number_and_the_rig(nominal: dict[str, float], tmp_path: Path) -> None:
