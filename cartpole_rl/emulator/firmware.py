@@ -247,6 +247,10 @@ class Firmware:
         else:
             zeros = self._zeros
             angle = pole - self._pole_zero
+            if self.armed and self._limits.cart_jumped():
+                self._latch(Fault.CART_ENCODER)
+            if self.armed and self._limits.pole_jumped():
+                self._latch(Fault.POLE_ENCODER)
             if self.armed and self._limits.lost(now_us, self.motor):
                 self._latch(Fault.CART_ENCODER)
                 self._brake_blindly(now_us)

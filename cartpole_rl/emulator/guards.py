@@ -78,6 +78,11 @@ class StallWatch:
         return self._anchor is not None and abs(cart - self._anchor[0]) >= self._moves
 
 
+def is_too_fast(moved: int, us: int, fastest: int) -> bool:
+    """Return whether a count `moved` faster than `fastest` counts/s; one count may come from rounding."""
+    return (abs(moved) - 1) * 1_000_000 > fastest * us
+
+
 class JumpWatch:
     """Detects a count that changes faster than the cart or pole can move."""
 
@@ -86,12 +91,9 @@ class JumpWatch:
         self._last: int | None = None
 
     def jumped(self, count: int, us: int) -> bool:
-        """Return whether this count is impossible `us` after the last one.
-
-        One count may come from rounding.
-        """
+        """Return whether this count is impossible `us` after the last one."""
         last, self._last = self._last, count
-        return last is not None and (abs(count - last) - 1) * 1_000_000 > self._fastest * us
+        return last is not None and is_too_fast(count - last, us, self._fastest)
 
 
 class FrozenCartWatch:
@@ -199,14 +201,17 @@ class TrackLimits:
         self.hard = nearest_count(micrometres(hardware.hard_limit), hardware)  # counts inside a stop
         self._nanometres = hardware.cart_nanometres_per_count
         self._radians = hardware.encoders.radians
-        self._fast_pole = hardware.pole_counts_per_turn * FAST_POLE // 10  # counts/s
-        self._slow_pole = hardware.pole_counts_per_turn * SLOW_POLE // 10  # counts/s
+        self._turn = hardware.pole_counts_per_turn
+        self._fast_pole = self._turn * FAST_POLE // 10  # counts/s
+        self._slow_pole = self._turn * SLOW_POLE // 10  # counts/s
         self._hard_push = hardware.hard_push
         self._lost = max(LOST_NM, LOST_COUNTS * self._nanometres)
         self._braking = round(1e6 * hardware.braking)  # um/s^2
         self.blocked = 0  # direction in which motor values are held at 0
         self.brake = 0  # direction of the full motor value that brakes the cart
         self._lever, self._look_us = lever, look_us
+        self._samples = samples
+        self._fresh = 0  # of them, taken since the cart was armed
         self._us: deque[int] = deque(maxlen=samples)
         self._carts: deque[int] = deque(maxlen=samples)
         self._poles: deque[int] = deque(maxlen=samples)
@@ -219,20 +224,34 @@ class TrackLimits:
     def sample(self, now_us: int, cart: int, pole: int) -> None:
         """Take a sample of the raw counts, unless the newest is younger than `SAMPLE_US`."""
         if not self._us or now_us - self._us[-1] >= SAMPLE_US:
+            self._fresh = min(self._fresh + 1, self._samples)
             self._us.append(now_us)
             self._carts.append(cart)
             self._poles.append(pole)
 
+    def cart_jumped(self) -> bool:
+        """Return whether the cart's count changed faster than a cart can move, since `forget`."""
+        return self._jumped(self._carts, FASTEST_CART // self._nanometres)
+
+    def pole_jumped(self) -> bool:
+        """Return whether the pole's count changed faster than a pole can turn, since `forget`."""
+        return self._jumped(self._poles, FASTEST_POLE * self._turn)
+
+    def _jumped(self, counts: deque[int], fastest: int) -> bool:
+        if self._fresh < self._samples:
+            return False
+        return is_too_fast(counts[-1] - counts[0], self._us[-1] - self._us[0], fastest)
+
     def forget(self) -> None:
-        """Start the estimate anew: the cart is armed now."""
-        self._count = None
+        """Start the estimate anew: the cart is armed now, and a hand may have moved it before."""
+        self._count, self._fresh = None, 0
 
     def lost(self, now_us: int, motor: int) -> bool:
         """Return whether the cart's count stands still although the cart must have moved.
 
         `motor` is the value in force since the last look.
         """
-        us, self._looked_us = min(now_us - self._looked_us, SLOWED_US), now_us
+        us, self._looked_us = max(0, min(now_us - self._looked_us, SLOWED_US)), now_us
         if not self._stands:
             self._count = self._newest
             self._speed_um, self._way_nm = max(-FASTEST, min(FASTEST, self._cart_speed())), 0

@@ -31,6 +31,8 @@ SIDES = {LEFT: "left", RIGHT: "right", LEFT | RIGHT: "left and right"}
 RELEASED = 30_000  # um; so far inside the place where it is pressed, any switch is released
 AGAINST_STOP = 400_000  # us under full push without motion that mean a stop
 STANDS = 300_000  # nm, largest motion in that time, or one count
+RUNS = 0.1  # m/s, from which a cart takes time to stop, unless something stops it at once
+HARDEST_STOP = 5.0  # m/s^2, of friction, the pole and the motor
 LONGEST_SEARCH = 30_000_000, 20  # us for one stop; at least so many for a um of the track
 LONGEST_LEAVING = 5_000_000  # us to move off a switch, for which a second is usual
 CENTRED = 1_000_000  # nm
@@ -197,6 +199,32 @@ class Window:
         return round((max(self._counts) + min(self._counts)) / 2)
 
 
+class HeldWatch:
+    """Detects that a stop or something else holds a driven cart, or that its encoder is dead."""
+
+    def __init__(self, hardware: Hardware) -> None:
+        self._metres = hardware.encoders.metres
+        self._stands = max(1, STANDS // hardware.cart_nanometres_per_count)  # counts
+        self._fast = hardware.pole_counts_per_turn * FAST // 10  # counts/s
+        self._full_push = RoughMotor(hardware).value(hardware.gentle_force)
+        self._ran = 0.0  # m/s, at the reading before; 0 if the pole was fast
+        self.window = Window(AGAINST_STOP)
+
+    def is_held(self, before: Reading, reading: Reading, direction: int, motor: int, travels: bool) -> bool:
+        """Return whether the cart stands under a full push, or stopped at once where it `travels`.
+
+        A fast pole can stop a cart.
+        """
+        ran, fast = direction * self._ran, pole_speed(before, reading) > self._fast
+        moved = reading.cart - before.cart
+        way = (ran - HARDEST_STOP / 2 * reading.seconds) * reading.seconds  # m
+        runs_on = travels and not fast and ran >= RUNS and way > 2 * self._stands * self._metres
+        self._ran = 0.0 if fast else moved * self._metres / reading.seconds
+        self.window.add(reading.cart, reading.us)
+        pushed = motor == direction * self._full_push and self.window.spread <= self._stands
+        return (runs_on and abs(moved) <= self._stands) or pushed
+
+
 class Homing:
     """The homing of one rig."""
 
@@ -206,7 +234,6 @@ class Homing:
         self._metres, self._turn = hardware.encoders
         self._radians = hardware.encoders.radians
         self._span_um = micrometres(hardware.track_span)
-        self._stands = max(1, STANDS // self._nanometres)  # counts
         self._longest_search, self._longest_centring = (
             max(shortest, self._span_um * us) for shortest, us in (LONGEST_SEARCH, LONGEST_CENTRING)
         )
@@ -214,7 +241,6 @@ class Homing:
         self._released = nearest_count(RELEASED, hardware)
         self._ends = {LEFT: 0, RIGHT: 0}  # raw counts; where homing began, until they are found
         self._touch_zone = SWITCH_ZONE if hardware.switches else TOUCH_ZONE
-        self._full_push = RoughMotor(hardware).value(hardware.gentle_force)
 
     def home(self) -> Generator[int, Reading, Zeros]:
         """Perform the whole homing. Raises HomingError.
@@ -230,7 +256,7 @@ class Homing:
             raise HomingError(f"the ends are {span / 1e9:.3f} m apart, not {track}")
         middle = (left + right) // 2
         reading = yield from self.centre(middle, reading)
-        hanging, reading = yield from find_hanging(reading)
+        hanging, reading = yield from self.find_hanging(reading)
         reading = yield from self.brake_swing(middle, hanging, reading)
         reading = yield from self.centre(middle, reading)
         return Zeros(left, right, (yield from self.wait_until_still(reading)))
@@ -273,6 +299,11 @@ class Homing:
         if suspects:
             raise HomingError(f"end switch {SIDES[suspects]}: pressed where it cannot be", suspects)
 
+    def _check_no_switch(self, reading: Reading) -> None:
+        """Raise HomingError if a switch is pressed in the middle of the track."""
+        if reading.pressed:
+            raise HomingError(f"end switch {SIDES[reading.pressed]}: pressed in the middle", reading.pressed)
+
     def touch_stop(
         self, direction: int, expected: int | None, reading: Reading, switch: int = 0, until: int = 0
     ) -> Procedure:
@@ -283,7 +314,7 @@ class Homing:
         Raises HomingError if the cart moves the wrong way, faster than at the beginning, when it may have
         rolled, and faster than when a fast pole last pushed it.
         """
-        servo, window, elapsed, before = SpeedServo(self._hardware), Window(AGAINST_STOP), 0, reading
+        servo, watch, elapsed, before = SpeedServo(self._hardware), HeldWatch(self._hardware), 0, reading
         start, rolled = reading.cart, 0.0
         longest = LONGEST_LEAVING if switch and not until else self._longest_search
         while elapsed < longest:
@@ -298,10 +329,10 @@ class Homing:
             astray = (start - reading.cart) * direction * self._nanometres > ASTRAY
             if astray and -direction * speed > rolled:
                 raise HomingError("the cart moves the wrong way: its motor or its encoder is reversed")
-            before = reading
-            window.add(reading.cart, reading.us)
             motor = servo.motor(direction * (TRAVEL_SPEED if far else SEARCH_SPEED), speed, reading.seconds)
-            if window.spread <= self._stands and motor == direction * self._full_push:
+            held = watch.is_held(before, reading, direction, motor, far)
+            before = reading
+            if held:
                 if switch:
                     raise HomingError(f"end switch {SIDES[switch]}: as before, and the cart stands", switch)
                 return reading
@@ -313,7 +344,8 @@ class Homing:
 
     def centre(self, middle: int, reading: Reading) -> Procedure:
         """Move gently to the middle and switch the motor off."""
-        servo, elapsed, before, start = SpeedServo(self._hardware), 0, reading, reading.cart
+        servo, watch, elapsed, before = SpeedServo(self._hardware), HeldWatch(self._hardware), 0, reading
+        start = reading.cart
         while elapsed < self._longest_centring:
             self._check_switches(reading)
             away, past = middle - reading.cart, middle - before.cart
@@ -327,16 +359,35 @@ class Homing:
                 raise HomingError("the cart moves away from the middle")
             speed_here = away * self._metres  # m/s: it slows down over the last second
             target = max(-TRAVEL_SPEED, min(TRAVEL_SPEED, speed_here))
+            motor = servo.motor(target, speed, reading.seconds)
+            held = watch.is_held(before, reading, -1 if away < 0 else 1, motor, travels=True)
             before = reading
-            reading = yield servo.motor(target, speed, reading.seconds)
+            if held:
+                raise HomingError("the cart stands: something holds it, or its encoder is dead")
+            reading = yield motor
             elapsed += reading.us
         raise HomingError(f"not in the middle after {self._longest_centring / 1e6:.0f} s")
+
+    def find_hanging(self, reading: Reading) -> Generator[int, Reading, tuple[int, Reading]]:
+        """Watch the pole for a whole swing with the motor off; return the count at which it was fastest."""
+        hanging, fastest, elapsed = reading.pole, 0, 0  # fastest in counts/s
+        self._check_no_switch(reading)
+        while elapsed < WHOLE_SWING:
+            before = reading
+            reading = yield 0
+            self._check_no_switch(reading)
+            elapsed += reading.us
+            speed = pole_speed(before, reading)
+            if speed > fastest:
+                hanging, fastest = (reading.pole + before.pole) // 2, speed
+        return hanging, reading
 
     def brake_swing(self, middle: int, hanging: int, reading: Reading) -> Procedure:
         """Brake the pole's swing by moving the cart about the middle. Raises HomingError if that pumps it."""
         brake, window, elapsed, before = SwingBrake(self._hardware), Window(WHOLE_SWING), 0, reading
         widest = 0  # counts of the swing before the brake can have changed it much
         while elapsed < LONGEST_BRAKING:
+            self._check_no_switch(reading)
             window.add(reading.pole, reading.us)
             if window.spread <= self._swing(BRAKED):
                 return reading
@@ -361,6 +412,7 @@ class Homing:
         """Wait with the motor off until the pole's swing is small; return the count in its middle."""
         window, elapsed = Window(WHOLE_SWING), 0
         while elapsed < LONGEST_WAIT:
+            self._check_no_switch(reading)
             window.add(reading.pole, reading.us)
             if window.spread <= self._swing(STILL if elapsed < PATIENCE else NEARLY_STILL):
                 return window.centre
@@ -371,19 +423,6 @@ class Homing:
     def _swing(self, centidegrees: int) -> int:
         """Return an angle in counts, at least one."""
         return max(1, (centidegrees * self._turn + 18_000) // 36_000)
-
-
-def find_hanging(reading: Reading) -> Generator[int, Reading, tuple[int, Reading]]:
-    """Watch the pole for a whole swing with the motor off; return the count at which it was fastest."""
-    hanging, fastest, elapsed = reading.pole, 0, 0  # fastest in counts/s
-    while elapsed < WHOLE_SWING:
-        before = reading
-        reading = yield 0
-        elapsed += reading.us
-        speed = pole_speed(before, reading)
-        if speed > fastest:
-            hanging, fastest = (reading.pole + before.pole) // 2, speed
-    return hanging, reading
 
 
 def pole_speed(before: Reading, reading: Reading) -> int:

@@ -49,14 +49,24 @@ class CartPoleVector(Carts, VectorEnv[Array, Array, Array], EzPickle):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
-        """Start an episode on each cart; one seed serves all. Raises ConfigError for several."""
+        """Start an episode on each cart, or on those of the `reset_mask` in `options`, bool [num_envs].
+
+        One seed serves all. Raises ConfigError for several, or for another mask.
+        """
         if seed is not None and not isinstance(seed, int | np.integer):
             raise ConfigError(f"seed={seed}: give one integer, which seeds all carts")
         super().reset(seed=seed)
         self.seed_plant(seed)
-        self._present = self.env.reset()
+        chosen = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool)))
+        if chosen.dtype != bool or chosen.shape != (self.num_envs,) or not chosen.any():
+            raise ConfigError(f"reset_mask: give {self.num_envs} booleans, of which one is True at least")
+        if self._present is None or chosen.all():
+            self._present = self.env.reset()
+        else:
+            rows = torch.as_tensor(chosen).unsqueeze(1)
+            self._present = self.env.reset(self._present.set("_reset", rows))
         if self.renderer is not None:
-            start_all(self.renderer, self._present, range(self.num_envs))
+            start_all(self.renderer, self._present, np.flatnonzero(chosen).tolist())
             self.renderer.show()
         return self._present["observation"].numpy().copy(), {}
 

@@ -52,7 +52,7 @@ void loop() {
     static char text[16];
     static unsigned length = 0;
     static unsigned long measured_us = micros(), heard_ms = millis();
-    while (Serial.available() > 0) {
+    for (int bytes = 0; bytes < 64 && Serial.available() > 0; bytes++) { /* no stream of bytes stops the watchdog */
         char letter = (char)Serial.read();
         int motor;
         if (letter != '\n') {
@@ -71,6 +71,7 @@ void loop() {
     if (millis() - heard_ms > SILENCE_MS) drive(0); /* the watchdog */
     if (micros() - measured_us >= PERIOD_US) {
         measured_us += PERIOD_US;
+        if (micros() - measured_us >= PERIOD_US) measured_us = micros(); /* late lines are left out */
         noInterrupts();
         long cart = cart_counts, pole = pole_counts;
         interrupts();

@@ -116,6 +116,7 @@ static void add_limits(list *all, const cart *self)
     add(all, limits->speed_um);
     add(all, limits->way_nm);
     add(all, limits->sampled);
+    add(all, limits->fresh);
     for (size_t age = 0; age < CART_SPEED_SAMPLES; age++) {
         size_t slot = (limits->newest + CART_SPEED_SAMPLES - age) % CART_SPEED_SAMPLES;
         add(all, age < limits->sampled ? (int64_t)limits->us[slot] : 0);

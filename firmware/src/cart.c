@@ -188,11 +188,15 @@ static void apply_limits(cart *self, uint64_t now_us, int32_t cart_count, int32_
     if (self->homing) {
         cart_limits_release(&self->limits);
     } else {
+        if (self->armed && cart_limits_cart_jumped(&self->limits))
+            latch(self, CART_FAULT_CART_ENCODER);
+        if (self->armed && cart_limits_pole_jumped(&self->limits))
+            latch(self, CART_FAULT_POLE_ENCODER);
         if (self->armed && cart_limits_lost(&self->limits, now_us, cart_motor(self))) {
             latch(self, CART_FAULT_CART_ENCODER);
             cart_limits_brake_blindly(&self->limits, now_us);
-            place.armed = false;
         }
+        place.armed = self->armed;
         cart_limits_apply(&self->limits, now_us, &place);
     }
     if (cart_motor(self) != self->line.requested)

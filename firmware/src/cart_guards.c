@@ -43,13 +43,28 @@ bool cart_stalled(cart_stall_watch *watch, int32_t cart, int16_t motor, uint32_t
 }
 
 /* One count may come from rounding. */
+static bool too_fast(int64_t moved, int64_t us, int64_t fastest)
+{
+    return (moved - 1) * SECOND_US > fastest * us;
+}
+
+bool cart_cart_too_fast(int64_t moved, int64_t us)
+{
+    return too_fast(moved, us, FASTEST_CART);
+}
+
+bool cart_pole_too_fast(int64_t moved, int64_t us)
+{
+    return too_fast(moved, us, FASTEST_POLE);
+}
+
 static bool jumped(cart_jump_watch *watch, int32_t count, uint32_t period_us, int64_t fastest)
 {
     bool first = !watch->counted;
     int64_t moved = cart_distance(count, watch->last);
     watch->counted = true;
     watch->last = count;
-    return !first && (moved - 1) * SECOND_US > fastest * (int64_t)period_us;
+    return !first && too_fast(moved, (int64_t)period_us, fastest);
 }
 
 bool cart_cart_jumped(cart_jump_watch *watch, int32_t cart, uint32_t period_us)

@@ -50,7 +50,11 @@ void cart_guards_reset(cart_guards *guards);
 /* A push of at least CART_HARD_PUSH one way for 0.5 s that moves the cart by less than 1 mm. */
 bool cart_stalled(cart_stall_watch *watch, int32_t cart, int16_t motor, uint32_t period_us);
 
-/* A count that changes faster than cart or pole can move. */
+/* Have so many counts in `us` changed faster than cart or pole can move? */
+bool cart_cart_too_fast(int64_t moved, int64_t us);
+bool cart_pole_too_fast(int64_t moved, int64_t us);
+
+/* A count that changes so fast over a period. */
 bool cart_cart_jumped(cart_jump_watch *watch, int32_t cart, uint32_t period_us);
 bool cart_pole_jumped(cart_jump_watch *watch, int32_t pole, uint32_t period_us);
 

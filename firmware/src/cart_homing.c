@@ -21,6 +21,8 @@
     (!CART_SWITCHES || ((homing)->stage == CART_TOUCH_RIGHT && CART_SWITCHES != CART_RIGHT))
 #define AGAINST_STOP_US 400000u /* under full push without motion that mean a stop */
 #define STANDS_COUNTS AT_LEAST_ONE(300000 / CART_NANOMETRES) /* largest motion in that time: 0.3 mm */
+#define RUNS 0.1           /* m/s, from which a cart takes time to stop, unless something stops it at once */
+#define HARDEST_STOP 5.0   /* m/s^2, of friction, the pole and the motor */
 #define LONGEST_SEARCH_US (CART_SPAN_UM > 1500000 ? CART_SPAN_UM * 20u : 30000000u) /* for one stop */
 #define LONGEST_LEAVING_US 5000000u /* to move off a switch, for which a second is usual */
 #define CENTRED_NM 1000000
@@ -81,6 +83,7 @@ static bool first_reading(cart_homing *homing, const cart_reading *reading, uint
     homing->start = reading->cart;
     homing->elapsed_us = 0;
     homing->before = *reading;
+    homing->ran = 0;
     cart_servo_reset(&homing->servo);
     cart_window_reset(&homing->window, window_us);
     return true;
@@ -120,12 +123,35 @@ static bool switches_lie(cart_homing *homing, int32_t cart)
     return homing->suspects != 0;
 }
 
+/* True if a switch is pressed in the middle of the track. */
+static bool switches_lie_inside(cart_homing *homing)
+{
+    homing->suspects = homing->pressed;
+    return homing->pressed != 0;
+}
+
 /* A switch should have ended the motion; without one, a stop has to. */
 static outcome misses(cart_homing *homing, uint8_t side)
 {
     if (CART_SWITCHES)
         homing->suspects = side;
     return FAILS;
+}
+
+/* True if the cart stands under a full push in `direction` or, where it `travels`, stopped at once: a stop or something
+   else holds it, or its encoder is dead. A fast pole can stop a cart. */
+static bool is_held(cart_homing *homing, const cart_reading *reading, int direction, bool travels, double speed,
+                    int16_t motor)
+{
+    double ran = direction * homing->ran, time = seconds(reading);
+    bool fast = pole_speed(homing, reading) > FAST_POLE;
+    bool runs_on = travels && !fast && ran >= RUNS && (ran - HARDEST_STOP / 2 * time) * time > 2 * STANDS_COUNTS * CART_METRES;
+    bool stopped = runs_on && cart_distance(reading->cart, homing->before.cart) <= STANDS_COUNTS;
+    homing->ran = fast ? 0 : speed;
+    homing->before = *reading;
+    cart_window_add(&homing->window, reading->cart, reading->period_us);
+    bool pushed = motor == direction * CART_FULL_PUSH && cart_window_spread(&homing->window) <= STANDS_COUNTS;
+    return stopped || pushed;
 }
 
 /* Move until a stop holds the cart or, with switches, until that of `side` is `pressed` or released. The right end is
@@ -146,12 +172,9 @@ static outcome touch_stop(cart_homing *homing, const cart_reading *reading, int 
     double speed = cart_speed(homing, reading);
     if (goes_astray(homing, reading, direction, speed))
         return FAILS;
-    homing->before = *reading;
-    cart_window_add(&homing->window, reading->cart, reading->period_us);
     *motor = cart_servo_motor(&homing->servo, direction * (far ? TRAVEL_SPEED : SEARCH_SPEED), speed,
                               seconds(reading));
-    bool stands = cart_window_spread(&homing->window) <= STANDS_COUNTS;
-    if (!stands || *motor != direction * CART_FULL_PUSH)
+    if (!is_held(homing, reading, direction, far, speed, *motor))
         return YIELDS;
     return CART_SWITCHES ? misses(homing, side) : ENDS;
 }
@@ -194,7 +217,7 @@ static bool span_is_right(cart_zeros *zeros)
 /* Move gently to the middle and switch the motor off. */
 static outcome centre(cart_homing *homing, const cart_reading *reading, int16_t *motor)
 {
-    first_reading(homing, reading, 0);
+    first_reading(homing, reading, AGAINST_STOP_US);
     if (homing->elapsed_us >= LONGEST_CENTRING_US || (CART_SWITCHES && switches_lie(homing, reading->cart)))
         return FAILS;
     int32_t middle = cart_zeros_middle(&homing->zeros);
@@ -208,9 +231,8 @@ static outcome centre(cart_homing *homing, const cart_reading *reading, int16_t 
     if (added * CART_NANOMETRES > ASTRAY_NM)
         return FAILS;
     double target = cart_limit(metres(reading->cart, middle), TRAVEL_SPEED); /* slows down over a second */
-    homing->before = *reading;
     *motor = cart_servo_motor(&homing->servo, target, speed, seconds(reading));
-    return YIELDS;
+    return is_held(homing, reading, middle < reading->cart ? -1 : 1, true, speed, *motor) ? FAILS : YIELDS;
 }
 
 /* Watch the pole for a whole swing with the motor off; it hangs where it is fastest. */
@@ -228,6 +250,8 @@ static outcome find_hanging(cart_homing *homing, const cart_reading *reading, in
     }
     homing->before = *reading;
     *motor = 0;
+    if (CART_SWITCHES && switches_lie_inside(homing))
+        return FAILS;
     return homing->elapsed_us >= WHOLE_SWING_US ? ENDS : YIELDS;
 }
 
@@ -238,6 +262,8 @@ static outcome brake_swing(cart_homing *homing, const cart_reading *reading, int
         homing->widest = 0;
     if (homing->elapsed_us >= LONGEST_BRAKING_US)
         return ENDS;
+    if (CART_SWITCHES && switches_lie_inside(homing))
+        return FAILS;
     cart_window_add(&homing->window, reading->pole, reading->period_us);
     int64_t spread = cart_window_spread(&homing->window);
     if (spread <= BRAKED)
@@ -261,7 +287,7 @@ static outcome brake_swing(cart_homing *homing, const cart_reading *reading, int
 static outcome wait_until_still(cart_homing *homing, const cart_reading *reading, int16_t *motor)
 {
     first_reading(homing, reading, WHOLE_SWING_US);
-    if (homing->elapsed_us >= LONGEST_WAIT_US)
+    if (homing->elapsed_us >= LONGEST_WAIT_US || (CART_SWITCHES && switches_lie_inside(homing)))
         return FAILS;
     cart_window_add(&homing->window, reading->pole, reading->period_us);
     int64_t enough = homing->elapsed_us < PATIENCE_US ? STILL : NEARLY_STILL;

@@ -41,6 +41,8 @@ void cart_limits_sample(cart_limits *limits, uint64_t now_us, int32_t cart_count
         limits->newest = limits->sampled++;
     else
         limits->newest = oldest(limits);
+    if (limits->fresh < CART_SPEED_SAMPLES)
+        limits->fresh++;
     limits->us[limits->newest] = now_us;
     limits->carts[limits->newest] = cart_count;
     limits->poles[limits->newest] = pole_count;
@@ -74,14 +76,30 @@ static bool stands(const cart_limits *limits)
     return cart_distance(limits->carts[limits->newest], limits->count) <= 1;
 }
 
+static int64_t moved(const cart_limits *limits, const int32_t *counts)
+{
+    return limits->fresh < CART_SPEED_SAMPLES ? 0 : cart_distance(counts[limits->newest], counts[oldest(limits)]);
+}
+
+bool cart_limits_cart_jumped(const cart_limits *limits)
+{
+    return cart_cart_too_fast(moved(limits, limits->carts), window_us(limits));
+}
+
+bool cart_limits_pole_jumped(const cart_limits *limits)
+{
+    return cart_pole_too_fast(moved(limits, limits->poles), window_us(limits));
+}
+
 void cart_limits_forget(cart_limits *limits)
 {
     limits->counted = false;
+    limits->fresh = 0;
 }
 
 bool cart_limits_lost(cart_limits *limits, uint64_t now_us, int16_t motor)
 {
-    uint64_t passed_us = now_us - limits->looked_us;
+    uint64_t passed_us = now_us > limits->looked_us ? now_us - limits->looked_us : 0;
     int64_t us = passed_us < SLOWED_US ? (int64_t)passed_us : SLOWED_US;
     limits->looked_us = now_us;
     if (!limits->counted || !stands(limits)) {

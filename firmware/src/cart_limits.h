@@ -36,6 +36,7 @@ typedef struct {
     int8_t blocked; /* direction in which motor values are held at 0 */
     int8_t brake;   /* direction of the full motor value that brakes the cart */
     uint8_t sampled, newest;
+    uint8_t fresh; /* samples since the cart was armed, at most as many as tell the speed */
     uint64_t us[CART_SPEED_SAMPLES];
     int32_t carts[CART_SPEED_SAMPLES], poles[CART_SPEED_SAMPLES];
     uint64_t until_us; /* the brake acts until then */
@@ -59,7 +60,11 @@ typedef struct {
 /* Take a sample of the raw counts, unless the newest is younger than a millisecond. */
 void cart_limits_sample(cart_limits *limits, uint64_t now_us, int32_t cart_count, int32_t pole_count);
 
-/* Start the estimate of the cart's motion anew: the cart is armed now. */
+/* Has a count changed faster than cart or pole can move, over the samples if all were taken since it was armed? */
+bool cart_limits_cart_jumped(const cart_limits *limits);
+bool cart_limits_pole_jumped(const cart_limits *limits);
+
+/* Start the estimate of the cart's motion anew: the cart is armed now, and a hand may have moved it before. */
 void cart_limits_forget(cart_limits *limits);
 
 /* Does the cart's count change by one at most although the cart must have moved? `motor` is the value in force

@@ -65,6 +65,7 @@ def limits(firmware: Any) -> list[int]:
         limits._speed_um,
         limits._way_nm,
         len(samples),
+        limits._fresh,
         *(number for sample in samples + unused for number in sample),
     ]
 
@@ -109,7 +110,8 @@ def homing(firmware: Any) -> list[int]:
     if len(stack) < 2:
         return [0, 0, 0, 0, 0, -1, 0, 0]
     stage, local = stage_of(stack), stack[-1].gi_frame.f_locals
-    servo, window = local.get("servo"), local.get("window")
+    servo = local.get("servo")
+    window = local["watch"].window if "watch" in local else local.get("window")
     return [
         stage,
         local["elapsed"],

@@ -136,6 +136,39 @@ def test_homing_after_a_lost_zero_neither_pumps_the_pole_nor_strikes_the_stops()
     assert fastest < 0.4
 
 
+@pytest.mark.parametrize(
+    (
+        "dies",
+        "pushed",
+        "fastest",
+    ),  # s after HOME, s, m/s: on the way to the left, to the right, to the middle
+    [(3.0, 1.0, 0.95), (9.0, 0.05, 0.25), (12.5, 0.05, 0.25)],
+)
+def test_a_cart_encoder_that_dies_in_homing_ends_it(dies, pushed, fastest):
+    driven = Driven(stuck_encoder="cart", stuck_at=dies)
+    driven.cart.physics.place(0.05, math.pi)
+    state = driven.ask(Home())
+    while driven.flags & Flags.HOMING:
+        state = driven.ask(Hello())
+    assert state.fault == Fault.HOMING
+    assert driven.cart.now_us < 1e6 * (dies + pushed)
+    assert abs(driven.cart.physics.x_dot) < fastest
+
+
+@pytest.mark.parametrize("held", [9.0, 12.5])
+def test_a_cart_that_is_held_in_homing_ends_it(held):
+    driven = Driven()
+    driven.cart.physics.place(0.05, math.pi)
+    state, place = driven.ask(Home()), driven.x
+    while driven.flags & Flags.HOMING:
+        if driven.cart.now_us > 1e6 * held:
+            driven.cart.physics.place(place, driven.angle)
+        place = driven.x
+        state = driven.ask(Hello())
+    assert state.fault == Fault.HOMING
+    assert driven.cart.now_us < 1e6 * (held + 0.6)
+
+
 @FAILURES
 @pytest.mark.parametrize(("encoder", "fault"), [("cart", Fault.HOMING), ("pole", Fault.POLE_ENCODER)])
 def test_homing_fails_with_a_frozen_encoder(encoder, fault, fail):

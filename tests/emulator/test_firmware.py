@@ -256,15 +256,33 @@ def test_a_count_that_jumps_and_then_stands_still_is_never_braked(bench):
     assert bench.firmware.motor == 0
 
 
-@pytest.mark.parametrize("cart", [8_000, -8_000])
-def test_the_brake_does_not_answer_a_jump_of_the_count(bench, cart):
+@pytest.mark.parametrize("cart", [8_000, -8_000, 2_000])  # a period of 20 ms allows 0.1 m, or 4395 counts
+def test_a_jump_of_the_count_is_seen_at_once_and_the_brake_does_not_answer_it(bench, cart):
     bench.tick()
     motors = []
     for look in range(1, 20):
-        bench.firmware.look(bench.now_us + 1000 * look, 0 if look < 10 else cart, 2048)
+        bench.firmware.look(bench.now_us + 1000 * look, 0 if look < 10 else cart, HANGING)
         motors.append(bench.firmware.motor)
+        assert bench.firmware.fault == (Fault.CART_ENCODER if look >= 10 else Fault.NONE)
     assert not any(motors)
     assert bench.tick(cart)[0].fault == Fault.CART_ENCODER
+
+
+def test_a_jump_of_the_poles_count_is_seen_at_once(bench):
+    bench.tick()
+    for look in range(1, 20):
+        bench.firmware.look(bench.now_us + 1000 * look, 0, 600 if look >= 10 else HANGING)
+    assert bench.firmware.fault == Fault.POLE_ENCODER
+
+
+def test_a_hand_may_move_the_pole_until_the_cart_is_armed(bench):
+    bench.tick()
+    bench.send(Stop())
+    for look in range(1, 20):
+        if look == 10:
+            bench.send(Start())
+        bench.firmware.look(bench.now_us + 1000 * look, 0, 600 if look >= 10 else HANGING)
+    assert bench.firmware.fault == Fault.NONE
 
 
 @pytest.mark.parametrize(

@@ -102,6 +102,24 @@ def test_a_switch_that_lies_ends_homing(switches: int, reading: Callable[[float]
 
 
 @each_firmware
+@pytest.mark.parametrize("switches", [LEFT, BOTH], ids=["one", "both"])
+@pytest.mark.parametrize("quiet", [5, 99, 110, 450], ids=["hanging", "brake", "braking", "wait"])  # periods
+def test_a_switch_that_is_pressed_in_the_middle_ends_homing_at_once(quiet: int, switches: int) -> None:
+    """Counted from the end of the way to the middle, after the right end."""
+    driven = Driven(**settings_of(BOTH))
+    driven.cart.physics.place(0.03, math.pi - 1.2)
+    state, right, periods = driven.ask(Home()), False, 0
+    while driven.flags & Flags.HOMING:
+        right |= driven.x > HALF
+        periods += right and (periods > 0 or (abs(driven.x) < 0.01 and state.motor_applied == 0))
+        if periods == quiet:
+            driven.cart.physics._press_switches = lambda: setattr(driven.cart.physics, "switches", switches)
+        assert periods <= quiet + 2
+        state = driven.ask(Hello())
+    assert Fault(state.fault) == Fault.HOMING | Fault(switches * Fault.LEFT_SWITCH)
+
+
+@each_firmware
 @pytest.mark.parametrize("side", [-1, 1])
 def test_a_cart_whose_counts_slipped_is_stopped_by_a_switch(side: int) -> None:
     driven = homed(**settings_of(BOTH))

@@ -201,6 +201,13 @@ def test_many_carts_are_reset_first_and_take_one_seed() -> None:
         envs.step(np.zeros(2, int))
     with pytest.raises(ConfigError, match=r"seed=\[1, 2\]: give one integer"):
         envs.reset(seed=[1, 2])  # type: ignore[arg-type]
+    before = envs.reset(seed=3)[0]
+    for mask in ([True], np.zeros(2, bool), np.ones(2)):
+        with pytest.raises(ConfigError, match="reset_mask: give 2 booleans, of which one is True at least"):
+            envs.reset(options={"reset_mask": mask})
+    after = envs.reset(options={"reset_mask": np.array([True, False])})[0]
+    assert (before != after).any(axis=1).tolist() == [True, False]
+    assert envs.step(np.full(2, 8))[0].shape == before.shape
 
 
 def test_only_existing_actions_are_taken() -> None:

@@ -1,5 +1,6 @@
 """The Arduino sketch of a cart that speaks lines of text, compiled with a stand-in for the Arduino core."""
 
+import os
 import shutil
 import subprocess
 from collections.abc import Iterator
@@ -57,6 +58,20 @@ def test_it_drives_both_ways_and_stops_when_nobody_speaks(board: "subprocess.Pop
     tell(board, "-80\r\n")
     assert [said(board), said(board)] == [(RIGHT, 0), (LEFT, 80)]
     assert said(board) == (LEFT, 0)  # the watchdog
+
+
+def test_bytes_without_end_do_not_stop_the_watchdog_and_measurements(program: Path, tmp_path: Path) -> None:
+    endless, pipe = tmp_path / "endless", subprocess.PIPE
+    endless.write_bytes(b"200\n")
+    os.truncate(endless, 1 << 30)
+    with (
+        endless.open() as bytes_,
+        subprocess.Popen([program], stdin=bytes_, stdout=pipe, stderr=pipe, text=True) as board,
+    ):
+        assert [said(board), said(board)] == [(RIGHT, 200), (RIGHT, 0)]
+        assert board.stdout is not None
+        assert [board.stdout.readline() for _ in range(20)][-1]
+        board.kill()
 
 
 @pytest.mark.parametrize("bad", ["300", "12x", "", " ", "\r", "25\0x", "nan", "1" * 40, "--5"])

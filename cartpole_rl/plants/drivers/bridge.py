@@ -24,7 +24,7 @@ from typing import Self
 
 from cartpole_rl.emulator.firmware import LARGEST_MOTOR, WATCHDOG_PERIODS, Firmware
 from cartpole_rl.emulator.guards import FASTEST_CART, FASTEST_POLE, LONGEST_US, SHORTEST_US
-from cartpole_rl.emulator.homing import Homing, HomingError, Reading, Window, Zeros, find_hanging
+from cartpole_rl.emulator.homing import Homing, HomingError, Reading, Window, Zeros
 from cartpole_rl.emulator.link import Channel
 from cartpole_rl.errors import CartPoleError, ConfigError, LinkError, reason_of
 from cartpole_rl.plants.drivers.driver import Driver, Measurement, unwrapped
@@ -192,7 +192,7 @@ class StandIn(Firmware):
             self.board_homes = False
         middle = reading.cart - self._hardware.encoders.cart_counts(self._settings.home_position)
         reading = yield from homing.centre(middle, reading)
-        hanging, reading = yield from find_hanging(reading)
+        hanging, reading = yield from homing.find_hanging(reading)
         reading = yield from homing.brake_swing(middle, hanging, reading)
         reading = yield from homing.centre(middle, reading)
         return self._zeros_about(middle, (yield from homing.wait_until_still(reading)))
