@@ -2,6 +2,8 @@
 
 import copy
 from collections.abc import Sequence
+from functools import partial
+from typing import Any
 
 import torch
 from tensordict import TensorDict
@@ -12,13 +14,17 @@ from torchrl.objectives import DQNLoss
 from torchrl.objectives.utils import TargetNetUpdater
 
 from cartpole_rl.agents.settings import AgentSettings
+from cartpole_rl.errors import ConfigError, reason_of
 from cartpole_rl.learning.dqn import AdvantageLearningLoss
+
+TRIED = 64  # observations
 
 
 class QAgent(nn.Module):
     """The online network `actor`, the target network in `loss`, and the average that acts greedily.
 
-    `mirror_signs` [K] and `frames` [T, F] describe the observation: see `agents.network`.
+    `mirror_signs` [K] and `frames` [T, F] describe the observation: see `agents.network`. Raises ConfigError
+    for a network that `check_network` refuses.
     """
 
     updates: Tensor  # gradient steps so far, []
@@ -33,7 +39,9 @@ class QAgent(nn.Module):
     ) -> None:
         super().__init__()
         self.settings = settings
-        network = settings.network(settings, mirror_signs, actions, frames).to(device)
+        network = settings.network(settings, mirror_signs, actions, frames)
+        check_network(settings.network, network, len(mirror_signs), actions)
+        network = network.to(device)
         self.actor = QValueActor(network, in_keys=["observation"], spec=Categorical(actions))
         self.loss = self.make_loss()
         self.loss.make_value_estimator(gamma=settings.discount, device=device)
@@ -81,3 +89,41 @@ class QAgent(nn.Module):
         al., "Averaging weights leads to wider optima", 2018). Without `average_decay` they act themselves.
         """
         return self.actor if self.average is None else self.average
+
+
+@torch.no_grad()
+def check_network(name: str, network: Any, observation_size: int, actions: int) -> None:
+    """Raise ConfigError for a network that gives no action values [N, A], or acts otherwise in training.
+
+    Only trainable weights are averaged, and carts must not change each other's values. Copies are tried, with
+    other weights: a last layer of zeros hides what is before it. Neither the network nor torch's generator
+    changes.
+    """
+    said = f"agent.network={name}:"
+    if not isinstance(network, nn.Module):
+        raise ConfigError(f"{said} it returned {type(network).__name__}; return a torch.nn.Module")
+    generator = torch.Generator().manual_seed(0)
+    observations = torch.randn(TRIED, observation_size, generator=generator)
+    try:
+        with torch.random.fork_rng(devices=[]):
+            tried = copy.deepcopy(network)
+            for weight in tried.parameters():
+                weight.add_(0.1 * torch.randn(weight.shape, generator=generator))
+            training, driving, one = (copy.deepcopy(tried).train(each) for each in (True, False, False))
+            values, driven, alone = training(observations), driving(observations), one(observations[:1])
+    except Exception as error:  # of someone's own code
+        reason = f"{type(error).__name__}: {reason_of(error)}"
+        raise ConfigError(f"{said} it cannot read observations [N, {observation_size}]: {reason}") from error
+    shape = list(getattr(values, "shape", [type(values).__name__]))
+    if shape != [TRIED, actions]:
+        raise ConfigError(
+            f"{said} it gave {shape} for observations [{TRIED}, {observation_size}]; "
+            f"give action values [{TRIED}, {actions}]"
+        )
+    alike = partial(torch.allclose, rtol=1e-3, atol=1e-3, equal_nan=True)
+    moved = not all(map(torch.equal, training.buffers(), network.buffers()))
+    if moved or not alike(values, driven) or not alike(values[:1], alone):
+        raise ConfigError(
+            f"{said} it acts otherwise in training than afterwards, as Dropout and BatchNorm do; use "
+            "LayerNorm, or leave them out"
+        )

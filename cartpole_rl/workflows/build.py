@@ -76,6 +76,7 @@ def trained_agent(run: Path) -> TrainedAgent:
     training = recorded_settings(TrainConfig, checkpoint.config, f"run={run}")
     agent = new_agent(training)
     restore_weights(agent, checkpoint.weights, f"run={run}")
+    agent.eval()
     return TrainedAgent(training, agent.greedy_policy(), known_poles(training, checkpoint))
 
 

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 from cartpole_rl.agents.settings import AGENTS
 from cartpole_rl.errors import ConfigError
@@ -71,6 +72,31 @@ class Searched(torch.nn.Module):
 @AGENTS.register(learner=Search)
 class SearchedNetwork(QAgent):
     """Our network, found by random search."""
+
+def layers(*extra, less=0):
+    return lambda settings, signs, actions, frames: torch.nn.Sequential(
+        torch.nn.Linear(len(signs), 32), *extra, torch.nn.Linear(32, actions - less)
+    )
+
+def zeroed(settings, signs, actions, frames):
+    network = dropping(settings, signs, actions, frames)
+    torch.nn.init.zeros_(network[-1].weight)
+    return network
+
+class Stateful(torch.nn.Module):
+    """Has a recurrent state, of as many carts as it first met."""
+
+    def __init__(self, settings, signs, actions, frames):
+        super().__init__()
+        self.cell, self.state = torch.nn.GRUCell(len(signs), actions), None
+
+    def forward(self, observation):
+        self.state = self.cell(observation, self.state)
+        return self.state
+
+dropping, normed = layers(torch.nn.Dropout(0.1)), layers(torch.nn.BatchNorm1d(32))
+mixing = layers(torch.nn.BatchNorm1d(32, affine=False, track_running_stats=False))
+steady, short, no_module = layers(torch.nn.LayerNorm(32)), layers(less=1), lambda *given: None
 
 class Lines:
     def __init__(self, folder, purge_step=None):
@@ -153,3 +179,32 @@ def test_fine_tuning_refuses_one_with_a_learner_of_its_own(tmp_path: Path) -> No
 def test_what_cannot_be_one_is_refused(setting: dict[str, str], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         load_settings(TrainConfig, TOY | setting)
+
+
+@pytest.mark.parametrize(
+    ("network", "complaint"),
+    [
+        *((name, "acts otherwise in training than afterwards") for name in ("dropping", "normed", "zeroed")),
+        ("mixing", r"cannot read observations \[N, \d+\]: ValueError: Expected more than 1 value"),
+        ("short", r"gave \[64, 8\] for observations \[64, \d+\]; give action values \[64, 9\]"),
+        ("no_module", "returned NoneType; return a torch.nn.Module"),
+    ],
+)
+def test_a_network_that_cannot_drive_is_refused(network: str, complaint: str) -> None:
+    training = load_settings(TrainConfig, {**TOY, "agent.network": f"own_agents:{network}"})
+    with pytest.raises(ConfigError, match=rf"^agent\.network=own_agents:{network}: it {complaint}"):
+        new_agent(training)
+
+
+@pytest.mark.parametrize("network", ["steady", "Stateful"])
+def test_to_try_a_network_changes_nothing(network: str) -> None:
+    training = load_settings(TrainConfig, {**TOY, "agent.network": f"own_agents:{network}"})
+    torch.manual_seed(0)
+    tried = new_agent(training).actor.module[0].module
+    after, state = torch.get_rng_state(), getattr(tried, "state", None)
+    torch.manual_seed(0)
+    signs, actions = training.observation.mirror_signs, len(training.actions.motors)
+    alone = training.agent.network(training.agent, signs, actions, training.observation.frames)
+    assert torch.equal(torch.get_rng_state(), after)
+    assert state is None
+    assert all(map(torch.equal, tried.parameters(), alone.parameters()))
