@@ -12,7 +12,8 @@ from cartpole_rl.envs.guard import fitted_guard
 from cartpole_rl.envs.hardware import HardwareTransform
 from cartpole_rl.envs.settings import CartPoleSettings, ObservationSettings, TrackGuard
 from cartpole_rl.physics.models import Models
-from cartpole_rl.plants.settings import PlantSettings
+from cartpole_rl.plants.learned import model_and_carts
+from cartpole_rl.plants.settings import LearnedSettings, PlantSettings, SimulationSettings
 from cartpole_rl.plants.specs import Plant
 from cartpole_rl.randomization.identified import identified_carts
 from cartpole_rl.randomization.randomizer import Draws, Randomizer
@@ -32,14 +33,17 @@ def shipped_settings(overrides: Mapping[str, Any] | None = None) -> CartPoleSett
 Config = TypeVar("Config", bound=CartPoleSettings)
 
 
-def with_fitted_guard(config: Config) -> Config:
-    """Return `config` with the numbers of its track guard, fitted to its carts if they are not given."""
+def with_fitted_guard(config: Config, plant: PlantSettings | None = None) -> Config:
+    """Return `config` with the numbers of its track guard, fitted to its carts if they are not given.
+
+    On a learned `plant` they are fitted to the carts of the model. Raises CheckpointError, ConfigError.
+    """
     guard = config.guard
     if not guard.enabled or guard.numbers:
         return config
     shared = CartPoleSettings(**{name: getattr(config, name) for name in CartPoleSettings.model_fields})
-    if isinstance(config.randomization, IdentifiedSettings):
-        return with_guard_numbers(config, guard_numbers(shared))
+    if isinstance(plant, LearnedSettings) or isinstance(config.randomization, IdentifiedSettings):
+        return with_guard_numbers(config, guard_numbers(shared, plant))
     return with_guard_numbers(config, known_guard_numbers(shared.model_dump_json()))
 
 
@@ -54,12 +58,15 @@ def known_guard_numbers(settings: str) -> TrackGuard:
     return guard_numbers(CartPoleSettings.model_validate_json(settings))
 
 
-def guard_numbers(config: CartPoleSettings) -> TrackGuard:
-    """Return the numbers of the track guard, fitted to the carts of `config`."""
+def guard_numbers(config: CartPoleSettings, plant: PlantSettings | None = None) -> TrackGuard:
+    """Return the numbers of the track guard, fitted to the carts of `config` or of a learned `plant`."""
+    draws = randomizer(config)
     models = Models(config.cart_friction.model, config.pole_friction.model, config.actions.actuator)
+    if isinstance(plant, LearnedSettings):
+        draws, models = driven_carts(config, plant)
     motors, period = config.actions.motors, config.control_period
     track_end = config.nominal_cart["track_half_length"]
-    return fitted_guard(config.guard.quantile, randomizer(config), motors, models, period, track_end)
+    return fitted_guard(config.guard.quantile, draws, motors, models, period, track_end)
 
 
 def make_env(
@@ -97,8 +104,19 @@ def simulated_env(
     device: torch.device | str = "cpu",
 ) -> CartPoleEnv:
     """Return an environment over `carts` simulated carts. Raises CheckpointError, ConfigError."""
-    draws = randomizer(config, device)
+    config, draws = with_fitted_guard(config, plant), randomizer(config, device)
     return environment(config, plant.build(config, draws, carts, start, seed, compiled, device))
+
+
+def driven_carts(
+    config: CartPoleSettings, plant: SimulationSettings, device: torch.device | str = "cpu"
+) -> tuple[Draws, Models]:
+    """Return the source of the carts on `plant`, and what moves them. Raises CheckpointError, ConfigError."""
+    draws = randomizer(config, device)
+    if not isinstance(plant, LearnedSettings):
+        return draws, config.models(plant)
+    model, draws = model_and_carts(plant, config, draws)
+    return draws, model.models
 
 
 def randomizer(config: CartPoleSettings, device: torch.device | str = "cpu") -> Draws:

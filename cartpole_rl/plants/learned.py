@@ -201,15 +201,22 @@ def learned_carts(
     compiled: bool,
     device: torch.device | str,
 ) -> LearnedPlant:
-    """Return the plant of plant=learned. `plant.prior_share` of the carts come from `prior`.
+    """Return the plant of plant=learned, with the errors and the carts of `model_and_carts`."""
+    model, draws = model_and_carts(plant, config, prior)
+    return LearnedPlant(carts, model, draws, start, seed, device, compiled, config.hardware)
+
+
+def model_and_carts(
+    plant: LearnedSettings, config: "CartPoleSettings", prior: Draws
+) -> tuple[LearnedModel, IdentifiedCarts]:
+    """Return the model, and the source of its carts: `plant.prior_share` of them come from `prior`.
 
     Raises CheckpointError; ConfigError for a model of another cart.
     """
     model = load_model(plant.model)
     check_same_cart(model, config)
     found = cart_column(model.parameters, torch.float32)
-    draws = IdentifiedCarts(found, prior, plant.prior_share, LEAST_MEMORY * model.period)
-    return LearnedPlant(carts, model, draws, start, seed, device, compiled, config.hardware)
+    return model, IdentifiedCarts(found, prior, plant.prior_share, LEAST_MEMORY * model.period)
 
 
 def check_same_cart(model: LearnedModel, config: "CartPoleSettings") -> None:

@@ -1,6 +1,7 @@
 """Train an agent in randomized simulation, from settings to a run folder."""
 
 import math
+import sys
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
@@ -8,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from cartpole_rl.envs.build import randomizer, simulated_env, with_fitted_guard
+from cartpole_rl.envs.build import driven_carts, simulated_env, with_fitted_guard
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy, as_weights
@@ -30,13 +31,14 @@ from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.terminal import as_word, print_message, print_results, shown, waiting
 from cartpole_rl.workflows.build import new_agent, use_threads
-from cartpole_rl.workflows.checks import check_compiler, check_resumable, note_other_numbers
+from cartpole_rl.workflows.checks import check_compiler, check_resumable, is_given, note_other_numbers
 from cartpole_rl.workflows.config import TrainConfig, recorded_settings
 from cartpole_rl.workflows.monitor import TrainingMonitor
 from cartpole_rl.workflows.poles import emulated_words, words_of_run
 
 ROUNDING = 1e-6  # share: that of float32
 FALLEN = 0.9  # of the best score: a training that ends below it says so
+OF_CARTS = ("cart", "cart_friction", "pole_friction")
 LEAST = 10.0  # score of an agent that has learned something
 
 
@@ -63,7 +65,7 @@ def train(config: TrainConfig, folder: Path) -> float | None:
         check_compiler(config.device)
     use_threads(config.threads)
     seed_everything(config.seed)
-    config = with_fitted_guard(config)
+    config = with_fitted_guard(config, config.plant)
     carts, start = config.learning.carts, config.task.start
     env = simulated_env(config, config.plant, carts, start, config.seed, config.compile, config.device)
     agent = new_agent(config, config.device)
@@ -115,7 +117,7 @@ def training_view(config: TrainConfig, folder: Path) -> AbstractContextManager[W
 def preview(config: TrainConfig, folder: Path) -> None:
     """Write a picture of the carts that a training draws. Raises ConfigError if all are alike."""
     path = folder / FIGURES / "randomization.png"
-    save(drawn_carts(randomizer(config), config.seed), path)
+    save(drawn_carts(driven_carts(config, config.plant)[0], config.seed), path)
     print(f"{path} shows the drawn carts")
 
 
@@ -151,8 +153,14 @@ def print_notes(config: TrainConfig, draws: Draws) -> None:
     if "cart" not in config.plant.ignored:
         note_other_numbers("train", config.nominal_cart, (config.pole.choices or {}).values())
         note_blocked_track(config)
+        note_other_carts(config, draws)
+    elif given := [word for word in sys.argv[1:] if is_given(OF_CARTS, [word]) and word[:5] != "cart="]:
+        print_message(
+            "train",
+            f"note: {', '.join(given)}: plant={config.plant.kind} has its own cart and friction; only carts "
+            "that are drawn from randomization= have these numbers",
+        )
     note_unused_randomization(config, draws)
-    note_other_carts(config, draws)
     if config.guard.active:
         print_message("train", f"track guard: {config.guard.active}")
 
@@ -182,14 +190,18 @@ def warn_of_changes(drawn_from: Mapping[str, str]) -> None:
 
 def note_unused_randomization(config: TrainConfig, draws: Draws) -> None:
     """Print the ranges that change nothing with the chosen actions and friction models."""
-    models = config.models(config.plant)
+    if getattr(config.plant, "prior_share", 1) == 0:
+        if config.randomization:
+            print_message("train", "note: plant.prior_share=0: no cart is drawn from randomization=")
+        return
+    models = driven_carts(config, config.plant)[1]
     encoders = config.hardware.encoders
     if unused := without_effect(
         draws, config.ranges, config.actions.motors, models, config.control_period, encoders
     ):
         chosen = (
-            f"cart_friction={config.cart_friction.model}, pole_friction={config.pole_friction.model} and "
-            f"actuator {config.actions.actuator} with motor values {list(config.actions.motors)}"
+            f"cart_friction={models.cart_friction}, pole_friction={models.pole_friction} and "
+            f"actuator {models.actuator} with motor values {list(config.actions.motors)}"
         )
         print_message("train", f"note: randomization of {', '.join(unused)} has no effect with {chosen}")
 

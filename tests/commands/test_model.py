@@ -12,11 +12,15 @@ import torch
 import yaml
 from command_line import ONCE, TINY, Outcome, in_process
 
+from cartpole_rl.envs.build import driven_carts, simulated_env, with_fitted_guard
+from cartpole_rl.envs.guard import stopping_distance
 from cartpole_rl.evaluation.recordings import read_recording, write_recording
-from cartpole_rl.plants.learned import load_model
+from cartpole_rl.plants.learned import load_model, save_model
 from cartpole_rl.run_folder import experiments
 from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.workflows.config import TrainConfig, load_settings
 from cartpole_rl.workflows.model import next_command
+from cartpole_rl.workflows.train import print_notes
 
 SMALL = (
     "windows=20",
@@ -123,12 +127,49 @@ def test_an_agent_is_trained_on_it_and_judged_on_it(learned: tuple[Path, Outcome
     model = f"plant.model={learned[0]}"
     done = in_process("train", "plant=learned", model, *TINY, ONCE, "hydra.run.dir=run", folder=tmp_path)
     assert done.code == 0, done.err
+    assert "does not learn on" not in done.err  # it is judged on the model's cart
     assert json.loads((tmp_path / "run/metrics.json").read_text())["plant"] == "learned"
     words = ["plant=learned", model, "run=run", "episodes=2", "hydra.run.dir=learned"]
     done = in_process("evaluate", *words, folder=tmp_path)
     assert done.code == 0, done.err
     metrics = json.loads((tmp_path / "learned/metrics.json").read_text())
     assert (metrics["plant"], len(metrics["episodes"])) == ("learned", 2)
+
+
+def test_the_notes_and_the_preview_are_about_its_carts(
+    learned: tuple[Path, Outcome], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Any
+) -> None:
+    def notes(**settings: Any) -> str:
+        given = {"plant": "learned", "plant.model": str(learned[0]), **settings}
+        monkeypatch.setattr("sys.argv", ["", *(f"{name}={value}" for name, value in given.items())])
+        config = load_settings(TrainConfig, given)
+        print_notes(config, driven_carts(config, config.plant)[0])
+        return capsys.readouterr().err
+
+    other = {"step": "sigmoid", "sigmoid": "step"}[report(learned[0])["cart_friction"]]
+    slope = {"+randomization.sigmoid_slope": {"absolute": [50, 200]}}
+    assert ("sigmoid_slope has no effect with cart_friction=step" in notes(**slope)) == (other == "sigmoid")
+    assert f"note: cart_friction={other}: plant=learned has its own cart" in notes(cart_friction=other)
+    assert notes(**{"plant.prior_share": 0.0}).count("note: ") == 1
+    words = ["plant=learned", f"plant.model={learned[0]}", "randomization=none", "preview=true"]
+    done = in_process("train", *words, "hydra.run.dir=run", folder=tmp_path)
+    assert (done.code, (tmp_path / "run/figures/randomization.png").exists()) == (0, True)
+
+
+def test_its_guard_is_that_of_its_carts(learned: tuple[Path, Outcome], tmp_path: Path) -> None:
+    model = load_model(learned[0])
+    heavy = {**model.parameters, "cart_mass": 1.2, "latency": 0.06}
+    save_model(tmp_path / "model.pt", replace(model, parameters=heavy))
+    settings = {
+        "plant": "learned",
+        "plant.model": str(tmp_path),
+        "plant.prior_share": 0.0,
+        "guard": "careful",
+    }
+    config = load_settings(TrainConfig, settings)
+    own, wide = (with_fitted_guard(config, plant).guard.active for plant in (config.plant, None))
+    assert stopping_distance(1.0, own) > stopping_distance(1.0, wide) + 0.03
+    assert simulated_env(config, config.plant, 2, config.task.start, 0).hardware.guard == own
 
 
 def test_a_model_that_does_not_fit_is_refused(learned: tuple[Path, Outcome], tmp_path: Path) -> None:
