@@ -164,10 +164,13 @@ def read_posterior(path: Path) -> tuple[dict[str, Array], list[str]]:
 
 def read_samples(path: Path) -> tuple[dict[str, Array], list[str]]:
     """Return `read_posterior` of a .csv file. Raises ConfigError for an impossible value, UNREADABLE."""
-    with path.open(newline="", encoding="utf-8") as file:
-        rows = [*csv.DictReader(file, skipinitialspace=True)]
+    with path.open(newline="", encoding="utf-8-sig") as file:
+        reader = csv.DictReader(file, skipinitialspace=True)
+        rows, names = [*reader], reader.fieldnames or []
     if not rows:
         raise ValueError("it holds no cart")
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise ValueError(f"it has two columns {twice[0]}")
     for place, row in enumerate(rows, 1):
         if None in row or None in row.values():
             raise ValueError(f"cart {place} has more or fewer numbers than the first line has names")

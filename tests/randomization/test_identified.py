@@ -92,7 +92,7 @@ def test_samples_of_a_file_stay_together_by_row(
     ip02: dict[str, float], medium: PoleSettings, tmp_path: Path
 ) -> None:
     """A parameter without a column is drawn from its range."""
-    text = "cart_viscous, cart_coulomb\n0.1,0.5\n0.2,0.6\n0.4,0.3\n"
+    text = "\ufeffcart_viscous, cart_coulomb\n0.1,0.5\n0.2,0.6\n0.4,0.3\n"
     draws = identified_carts(of_samples(tmp_path / "carts.csv", text), ip02, medium)
     carts = CartParameters(draws.draw(500, torch.Generator().manual_seed(0)))
     pairs = {
@@ -111,6 +111,7 @@ def test_samples_of_a_file_stay_together_by_row(
         ("cart_mass\n", "holds no cart"),
         ("cart_mass\nheavy\n", "could not convert string to float: 'heavy'; write names of parameters"),
         ("cart_mass,latency\n0.5\n", "cart 1 has more or fewer numbers"),
+        ("cart_mass,cart_mass\n0.5,0.6\n", "it has two columns cart_mass; write names of"),
         ("cart_mas\n0.5\n", "did you mean 'cart_mass'"),
         ("cart_mass\n0.5\n-1\n", "cart_mass is -1; it must be above 0"),
         ("cart_mass\nnan\n", "cart_mass is nan; it must be above 0"),
