@@ -107,8 +107,11 @@ class Residual(NamedTuple):
         return self.last @ torch.tanh(self.second @ hidden + self.second_bias)
 
     def place_force(self, x: Tensor, member: Tensor) -> Tensor:
-        """Return the force of the tables of `member` [N] int64 at `x` [N] m, N, interpolated linearly."""
-        at = (x / self.spacing + PLACES // 2).clamp(0, PLACES - 1.001)
+        """Return the force of the tables of `member` [N] int64 at `x` [N] m, N, interpolated linearly.
+
+        NaN is taken for the left end: such a state stays NaN.
+        """
+        at = (x / self.spacing + PLACES // 2).nan_to_num().clamp(0, PLACES - 1.001)
         below = at.detach().floor()
         share, index = at - below, member * PLACES + below.long()
         table = self.places.reshape(-1)

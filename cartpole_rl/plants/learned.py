@@ -186,7 +186,9 @@ class LearnedPlant(SimulatedPlant):
         return {**super().snapshot(), "member": self.member.clone()}
 
     def restore(self, snapshot: Any) -> None:
-        """Return to `snapshot`."""
+        """Return to `snapshot`. Raises CheckpointError if the model then had more members."""
+        if int(snapshot["member"].max()) >= self._residual.members:
+            raise CheckpointError("plant.model has fewer members than when the run was saved; start anew")
         super().restore(snapshot)
         self.member.copy_(snapshot["member"])
 

@@ -77,13 +77,14 @@ def test_widened_members_differ_more_about_the_same_mean() -> None:
 
 def test_tables_are_interpolated_linearly() -> None:
     learned = residual()
-    middle, member = PLACES // 2, torch.tensor([1, 1, 1, 1])
-    x = learned.spacing * torch.tensor([3.0, 3.5, 4.0, 1e3], dtype=torch.float64)
+    middle, member = PLACES // 2, torch.ones(5, dtype=torch.int64)
+    x = learned.spacing * torch.tensor([3.0, 3.5, 4.0, 1e3, torch.nan], dtype=torch.float64)
     table = learned.units[0] * learned.places[1]
     force = learned.place_force(x, member)
     at, after = table[middle + 3], table[middle + 4]
     assert torch.allclose(force[:3], torch.stack((at, (at + after) / 2, after)))
     assert force[3].item() == pytest.approx(table[-1].item(), abs=0.01)  # beyond the end: that of the end
+    assert force[4] == table[0]
 
 
 def test_a_force_that_friction_holds_does_not_move_a_cart(make_cart: MakeCart) -> None:

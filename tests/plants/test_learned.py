@@ -124,6 +124,24 @@ def test_a_snapshot_goes_on_as_if_nothing_had_happened(make_learned: MakeLearned
         assert torch.equal(first, second)
 
 
+def test_a_snapshot_of_more_members_is_refused(make_learned: MakeLearned) -> None:
+    plant = make_learned()
+    plant.reset()
+    snapshot = plant.snapshot()
+    snapshot["member"][0] = 3
+    with pytest.raises(CheckpointError, match=r"^plant\.model has fewer members than when the run was saved"):
+        plant.restore(snapshot)
+
+
+def test_a_state_that_is_not_a_number_stays_one(make_learned: MakeLearned) -> None:
+    """The environment ends the episode, as on a simulated plant."""
+    plant = make_learned()
+    present = plant.reset()
+    plant.place(State(*torch.full((4, CARTS), torch.nan)))
+    plant.step(present.set("motor", torch.full((CARTS, 1), 220)))
+    assert torch.stack(plant.true_state).isnan().all()
+
+
 class TestFile:
     def test_it_comes_back(self, nominal: dict[str, float], tmp_path: Path) -> None:
         model = learned_model(nominal, 0.5)
