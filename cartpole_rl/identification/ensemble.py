@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from cartpole_rl.errors import LearningError, RecordingError
 from cartpole_rl.identification.matching import (
     COARSE,
     ROUNDS,
@@ -44,7 +45,10 @@ WIDEST, HALVINGS = 6.0, 5  # factor on the distances between members; steps of t
 
 
 class Ensemble:
-    """The learning of one ensemble on one set of windows, of a cart with `track_span` m between its stops."""
+    """The learning of one ensemble on one set of windows, of a cart with `track_span` m between its stops.
+
+    Raises RecordingError for a single window.
+    """
 
     def __init__(
         self,
@@ -55,6 +59,10 @@ class Ensemble:
         seed: int,
         track_span: float,
     ) -> None:
+        if windows.number < 2:
+            raise RecordingError(
+                "there is a single window to learn from: record longer, or give more windows"
+            )
         self.dynamics, self.settings = dynamics, settings
         self.windows = windows._replace(lead=lead_periods(LEAD, dynamics.period))
         self.scale = torch.maximum(
@@ -65,7 +73,8 @@ class Ensemble:
         self.generator = torch.Generator().manual_seed(seed)
         members = settings.members
         draws = torch.rand(members, windows.number, generator=self.generator, dtype=torch.float64)
-        self.left_out = draws.argsort(1).argsort(1) < settings.validation * windows.number  # [M, W]
+        share = max(1, min(settings.validation * windows.number, windows.number - 1))
+        self.left_out = draws.argsort(1).argsort(1) < share  # [M, W]; at least one is, and one is not
         weight = -torch.rand(draws.shape, generator=self.generator, dtype=torch.float64).log()
         self.weight = weight * ~self.left_out  # [M, W], of each window for each member
         largest = torch.tensor([float(LARGEST_MOTOR)], dtype=torch.float64)
@@ -83,7 +92,8 @@ class Ensemble:
     def learn(self, on_refresh: Callable[[int, list[float]], None] = lambda *_: None) -> Residual:
         """Make all updates; return each member as it best predicted the windows left out.
 
-        `on_refresh` is called with the number of updates and each member's loss on those windows.
+        `on_refresh` is called with the number of updates and each member's loss on those windows. Raises
+        LearningError if it diverges.
         """
         weights = [weight.clone().requires_grad_() for weight in self.residual.weights]
         optimizer = torch.optim.Adam(weights, self.settings.learning_rate)
@@ -92,7 +102,9 @@ class Ensemble:
         self.refresh(ROUNDS, 0)
         for update in range(1, self.settings.updates + 1):
             optimizer.zero_grad()
-            self.cost().backward()
+            cost = self.cost()
+            check_finite(cost)
+            cost.backward()
             torch.nn.utils.clip_grad_norm_(weights, 1e3)
             optimizer.step()
             falling.step()
@@ -130,7 +142,12 @@ class Ensemble:
         return float((np.abs(errors) <= certain)[judged].mean())
 
     def refresh(self, rounds: int, update: int) -> None:
-        """Match the initial states again, and keep each member that beats its best loss so far."""
+        """Match the initial states again, and keep each member that beats its best loss so far.
+
+        Raises LearningError.
+        """
+        with torch.no_grad():
+            check_finite(self.residuals())
         self.initial = match_initial_states(
             self.dynamics, self.positions, self.motors, self.scale, self.residual, self.initial.motion, rounds
         )
@@ -172,3 +189,9 @@ class Ensemble:
         angle = torch.pi * inputs[2]
         inputs[2], inputs[3] = torch.sin(angle), torch.cos(angle)
         return inputs.unsqueeze(0)
+
+
+def check_finite(numbers: Tensor) -> None:
+    """Raise LearningError if one of the numbers is not finite."""
+    if not numbers.isfinite().all():
+        raise LearningError("learning diverged; try a smaller ensemble.learning_rate")

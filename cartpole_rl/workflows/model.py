@@ -59,10 +59,11 @@ def learn_model(config: ModelConfig, folder: Path) -> None:
     Writes into `folder` config.yaml, provenance.json, model.pt (for plant=learned), model.json (parameters
     and errors) and figures/model.png, and prints tables of the errors on held-out recordings. Raises
     RecordingError for missing, damaged, too short or implausible recordings, ConfigError for several poles or
-    a folder that already holds a run.
+    a folder that already holds a run, LearningError if learning diverges.
     """
     use_threads(config.threads)
-    paths = [path for source in config.source for path in recordings(source)]
+    found = (path for source in config.source for path in recordings(source))
+    paths = [*{path.resolve(): path for path in found}.values()]  # one that is given twice counts once
     loaded = [read_recording(path) for path in paths]
     episodes = [each.episode for each in loaded]
     by_file = {str(path): each for path, each in zip(paths, episodes, strict=True)}
@@ -158,7 +159,7 @@ def results(
 ) -> dict[str, Any]:
     """Return the part of model.json that follows from learning."""
     return {
-        "learned_from_windows": ensemble.positions.shape[2],
+        "learned_from_windows": int((~ensemble.left_out).any(0).sum()),
         "held_out_windows": held_out.number,
         "widening": float(model.residual.widening),
         "cart_friction": str(model.models.cart_friction),

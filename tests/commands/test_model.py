@@ -45,7 +45,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def learned(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Outcome]:
     """The run folder of a small ensemble, and what was printed."""
     folder = tmp_path_factory.mktemp("model")
-    both = ",".join(str(recorded / f"recordings/episode_00{number}.csv") for number in range(2))
+    both = ",".join(str(recorded / f"recordings/episode_00{number}.csv") for number in (0, 1, 0))
     done = in_process("model", f"from=[{both}]", *SMALL, "hydra.run.dir=run", folder=folder)
     assert done.code == 0, done.err
     return folder / "run", done

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
+from cartpole_rl.errors import LearningError, RecordingError
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.identification.ensemble import Ensemble
 from cartpole_rl.identification.matching import match_initial_states
@@ -184,6 +185,24 @@ def test_initial_states_are_found(record: Record, dynamics: Dynamics) -> None:
     form = again.form[0]
     assert torch.allclose(form, form.mT, atol=1e-8)
     assert (torch.linalg.eigvalsh(form) > -1e-9).all()
+
+
+def test_learning_that_diverges_names_the_setting(record: Record, dynamics: Dynamics) -> None:
+    fast = SETTINGS.model_copy(update={"learning_rate": 100.0})
+    with pytest.raises(LearningError, match=r"diverged; try a smaller ensemble\.learning_rate"):
+        Ensemble(record(False)[0], dynamics, np.array([1.0, 0.4]), fast, 0, SPAN).learn()
+
+
+@pytest.mark.parametrize("validation", [0.001, 0.999])
+def test_a_window_is_left_out_and_one_is_not(record: Record, dynamics: Dynamics, validation: float) -> None:
+    windows, settings = record(False)[0], SETTINGS.model_copy(update={"validation": validation})
+    left_out = Ensemble(windows, dynamics, np.ones(2), settings, 0, SPAN).left_out.sum(1)
+    assert (left_out == (1 if validation < 0.5 else windows.number - 1)).all()
+    one = windows._replace(positions=windows.positions[:, :, :1], motors=windows.motors[:, :1])
+    with pytest.raises(
+        RecordingError, match="a single window to learn from: record longer, or give more windows"
+    ):
+        Ensemble(one, dynamics, np.ones(2), settings, 0, SPAN)
 
 
 def test_the_same_seed_learns_the_same(record: Record, dynamics: Dynamics) -> None:
