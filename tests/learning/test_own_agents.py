@@ -150,7 +150,7 @@ def test_it_is_trained_logged_and_driven(tmp_path: Path) -> None:
     assert not list(run.glob("events*"))
     assert len((run / "history.jsonl").read_text().splitlines()) == 3
     agent = trained_agent(run)
-    assert agent.training.agent.kind == kind
+    assert (agent.training.agent.kind, agent.policy.training) == (kind, False)
     assert len(run_batch(nominal_env(agent.training), agent.policy)) == 2
     assert json.loads((run / "metrics.json").read_text())["score"]["mean"] == pytest.approx(score)
     with pytest.raises(ConfigError, match=rf"agent\.kind={kind}, .* cannot be exported"):
