@@ -61,7 +61,8 @@ class Agent:
     """One run of a group. `values` maps evaluations to the measure; `curves` are those of its training.
 
     `behaviour` maps evaluations to further means over the episodes, by their keys in metrics.json. `seeds`
-    are those of the runs that made the agent, the last one first; `source` is what the run starts from.
+    are those of the runs that made the agent, the last one first; `source` is the run that it starts from, or
+    the hash or the name of an agent without a run.
     """
 
     group: str

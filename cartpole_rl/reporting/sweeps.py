@@ -73,14 +73,14 @@ class Member:
 
     @property
     def agent_key(self) -> tuple[Any, ...]:
-        """What tells its agent from others of its group: the seeds, or the hash if they are not known."""
-        return self.seeds or (self.run.provenance.get(AGENT_HASH),)
+        """What tells its agent from others of its group: the seeds, and the source if its run is lost."""
+        return self.seeds if self.agent or not self.run.agent else (*self.seeds, self.source)
 
     @property
     def source(self) -> str:
-        """The agent that the run starts from, or the run itself."""
+        """The run that the run starts from, or itself; the hash or the name of an agent without a run."""
         if self.agent is None and self.run.agent:
-            return self.run.agent  # its run is gone, or there was none
+            return self.run.provenance.get(AGENT_HASH) or self.run.agent
         return os.path.realpath((self.agent or self.run).folder)
 
     @property
@@ -400,9 +400,14 @@ def _member(run: Run, agents: dict[Path, Run]) -> Member:
         tree[AGENT] = _agent_tree((run, *chain))
     elif run.agent:
         tree[SOURCE] = run.agent
-    trained = run.agent and run.agent != str(BASELINE) and not is_own_policy(Path(run.agent))
-    made_by = chain if run.program in EPISODIC and trained else [run, *chain]  # a lost one has no known seed
+    # the seed of a lost agent is not known
+    made_by = chain if run.program in EPISODIC and _is_trained(run) else [run, *chain]
     return Member(run, chain[0] if chain else None, tree, tuple(each.seed or 0 for each in made_by))
+
+
+def _is_trained(run: Run) -> bool:
+    """Return True for a run that starts from a trained agent."""
+    return run.agent not in ("", str(BASELINE)) and not is_own_policy(Path(run.agent))
 
 
 def _chain(run: Run, agents: dict[Path, Run]) -> list[Run]:
@@ -454,10 +459,10 @@ def _seeds(seeds: set[int]) -> str:
 
 def _untraced(sweep: Sweep) -> list[str]:
     """Return a note on agents whose own runs are not there."""
-    named = {member.run.agent for member in sweep.members if member.agent is None} - {"", str(BASELINE)}
-    runs = [run for run in map(Path, named) if not is_own_policy(run) and run.parts[:1] != (PRETRAINED,)]
-    lost = count_text(len(runs), "agent")
-    return [f"The runs of {lost} were not found and are not checked."] if runs else []
+    named = [member for member in sweep.members if not member.agent and _is_trained(member.run)]
+    lost = {member.source for member in named if Path(member.run.agent).parts[:1] != (PRETRAINED,)}
+    count = count_text(len(lost), "agent")
+    return [f"The runs of {count} were not found and are not checked."] if lost else []
 
 
 def _check_measure(sweeps: Sequence[Sweep], measure: str) -> None:

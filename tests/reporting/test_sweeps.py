@@ -305,3 +305,9 @@ def test_agents_of_a_training_are_compared_in_pairs_on_two_carts(study: Path, ed
     assert cells(page, "agents") == ["3, paired"]
     assert cells(page, "chance that compare is higher") == ["0 (0 to 0)"]
     assert cells(compared("quick/friction/much/1[01]/evaluations/heavy"), "agents") == ["3 and 2, unpaired"]
+    for file in study.glob("*/*/evaluations/heavy/provenance.json"):  # lost agents of one path
+        edit(file, lambda content, file=file: content.update(agent_sha256=file.parts[3]))
+        edit(file.with_name("config.yaml"), lambda content: content.update(run="agents/lost"))
+    assert cells(compared("quick/friction/much/*/evaluations/heavy"), "agents") == ["3, paired"]
+    (lost,), _ = read_groups({"runs": ["quick/friction/*/*/evaluations/heavy"]}, MEASURE)
+    assert "The runs of 3 agents were not found and are not checked." in results_of(lost, MEASURE).notes
