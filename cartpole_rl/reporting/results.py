@@ -25,7 +25,10 @@ MEASURES = {  # key of metrics.json: label
     "errors.median": "median relative error of the parameters",
     "network_over_physics.theta_deg": "error of the angle, with / without network",
 }
-LOW_IS_GOOD = ("errors", "rms_", "time_to_", "network_over_")  # starts of measures
+LOW_IS_GOOD = (  # starts of measures
+    *("errors", "rms_", "time_to_", "network_over_", "guarded_fraction", "motor_reversals_per_s"),
+    *("late_ticks", "lost_frames", "bad_frames", "ended_by."),
+)
 SCORES = get_args(Measure)
 SCORE_DECIMALS = 1  # at most
 LARGEST = 1e30  # of all numbers; figures and means of larger ones overflow
@@ -153,7 +156,7 @@ def is_number(value: Any) -> bool:
 
 def low_is_good(measure: str) -> bool:
     """Return True for a measure of which less is better."""
-    return measure.startswith(LOW_IS_GOOD)
+    return measure.startswith(LOW_IS_GOOD) and measure != "ended_by.time"
 
 
 def measure_label(measure: str) -> str:

@@ -15,6 +15,7 @@ import yaml
 
 from cartpole_rl.errors import CheckpointError
 from cartpole_rl.reporting.results import is_number
+from cartpole_rl.reporting.texts import ENDINGS
 from cartpole_rl.run_folder import (
     AGENT_HASH,
     CHECKPOINTS,
@@ -37,6 +38,7 @@ from cartpole_rl.run_folder import (
 RUNS = "runs"  # the folder in which commands make their runs
 RESULTS = {"identify": (IDENTIFIED,), "model": (MODELLED,), "finetune": (METRICS, COMPARISON)}
 EPISODIC = ("evaluate", "record")  # commands that keep what they have after an interruption
+NOT_SHOWN = ("replay", "report", "import", "export")  # commands without such results
 # packages whose versions change results
 COMPARED_PACKAGES = ("cartpole_rl", "torch", "torchrl", "tensordict", "numpy", "mujoco")
 # settings that seeds of one set-up may differ in; the last parts of dotted names
@@ -131,6 +133,8 @@ def read_run(folder: Path) -> Run:
         return replace(run, problem=_interruption(run) or _outdated(run))
     except FileNotFoundError as error:
         missing = f"unfinished: it has no {Path(error.filename).name}{_end_of_log(folder)}"
+        if run.program in NOT_SHOWN:
+            missing = f"a run of {PREFIX}{run.program}, which a report does not show"
         return replace(run, problem=_failure(folder) or missing)
     except DAMAGE as error:
         return replace(run, problem=f"damaged results: {short(error)}")
@@ -287,8 +291,10 @@ def measured(results: Mapping[str, Any], measure: str) -> float | None:
 
 def _at(results: Mapping[str, Any], measure: str) -> Any:
     found: Any = results
+    above = ""
     for key in measure.split("."):
-        found = found.get(key) if isinstance(found, Mapping) else None
+        absent = 0 if above == "ended_by" and key in ENDINGS else None  # its counts lack those of 0
+        found, above = found.get(key, absent) if isinstance(found, Mapping) else None, key
     return found
 
 

@@ -9,7 +9,7 @@ from cartpole_rl.reporting.groups import (
     profile_curves,
     training_curves,
 )
-from cartpole_rl.reporting.results import Agent, Group, Results
+from cartpole_rl.reporting.results import Agent, Group, Results, low_is_good
 from cartpole_rl.reporting.runs_page import figure_parts
 
 AGENTS = np.array([400.0, 450.0, 490.0])
@@ -29,6 +29,11 @@ def test_trainings_of_other_lengths_are_drawn_over_their_share() -> None:
         axes = training_curves(groups, "score", palette([*groups])).axes[0]
         assert axes.get_xlabel().replace("\n", " ").startswith(label)
         assert axes.dataLim.x1 == pytest.approx(1.0 if end == 4e6 else 0.3)
+
+
+def test_of_errors_and_of_endings_before_the_time_less_is_better() -> None:
+    names = ("rms_angle_rad", "guarded_fraction", "late_ticks", "ended_by.track", "ended_by.time", "score")
+    assert [low_is_good(name) for name in names] == [True] * 4 + [False] * 2
 
 
 def results_of(count: int) -> Results:

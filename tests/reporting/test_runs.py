@@ -11,6 +11,7 @@ from cartpole_rl.reporting.runs import (
     Run,
     find_runs,
     learning_curve,
+    measured,
     partly_measured_note,
     read_run,
 )
@@ -99,7 +100,7 @@ def test_an_evaluation_of_an_earlier_checkpoint_does_not_count(study: Path, edit
     assert read_run(folder).problem == ""
 
 
-def test_a_run_that_failed_shows_the_end_of_its_log(study: Path) -> None:
+def test_a_run_that_failed_shows_the_end_of_its_log(study: Path, edit: Edit) -> None:
     folder = study / "much/11/evaluations/heavy"
     (folder / "log.txt").write_text("starting\nno space left\n\n")
     assert read_run(folder).problem == ""
@@ -107,6 +108,8 @@ def test_a_run_that_failed_shows_the_end_of_its_log(study: Path) -> None:
     assert (
         read_run(folder).problem == "unfinished: it has no metrics.json; its log.txt ends with: no space left"
     )
+    edit(folder / "provenance.json", lambda content: content.update(program="cartpole-replay"))
+    assert read_run(folder).problem == "a run of cartpole-replay, which a report does not show"
 
 
 def test_a_failed_job_says_why(study: Path) -> None:
@@ -150,6 +153,13 @@ def test_failed_jobs_and_links_are_found(tmp_path: Path) -> None:
     found = {path.name: path for path in find_runs(tmp_path / "sweep")}
     assert {*found} == {"0", "1", "2", "3"}
     assert read_run(found["3"]).problem == "a link to nothing"
+
+
+def test_an_ending_that_no_episode_had_is_counted_as_0() -> None:
+    results = {"ended_by": {"time": 3}, "score": {"mean": 1.0}}
+    names = ("ended_by.time", "ended_by.track", "ended_by.bogus", "score", "score.track")
+    assert [measured(results, name) for name in names] == [3, 0, None, 1, None]
+    assert measured({}, "ended_by.track") is None
 
 
 def test_a_mean_over_a_part_of_the_episodes_is_noted() -> None:
