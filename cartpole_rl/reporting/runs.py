@@ -92,6 +92,12 @@ class Run:
         return self.config.get("run") or ""
 
     @property
+    def kept(self) -> str:
+        """The policy that a fine-tuning kept, "before" or "after"; empty for other runs."""
+        kept = _at(self.results, f"{Path(COMPARISON).stem}.kept")
+        return kept if isinstance(kept, str) else ""
+
+    @property
     def versions(self) -> str:
         """The versions of the packages that change results: "cartpole_rl 0.1.0, torch 2.15.0, ...".
 

@@ -33,7 +33,7 @@ from cartpole_rl.reporting.statistics import (
     probability_of_improvement,
 )
 from cartpole_rl.reporting.style import document, escaped, svg, table
-from cartpole_rl.reporting.texts import count_text, number_text
+from cartpole_rl.reporting.texts import count_text
 from cartpole_rl.run_folder import ANIMATION, FIGURES, TABLE
 
 BUDGET = 12_000_000  # bytes of all pictures; a page takes a third more
@@ -372,7 +372,7 @@ class Gallery:
         labels = {group.name: group.label for group in results.groups}
         for name, agent, value, path in chosen(results):
             which = f"{labels[agent.group]}, seed {agent.seed_text}"
-            text = f"{name}: {which}, {label} {number_text(value)}"
+            text = f"{name}: {which}, {label} {value_text(value, results.measure)}"
             alt = f"Animation of one episode of the {name} agent ({which})"
             if data := self._read(path, lambda path: smaller(path, self.width, self.every)):
                 yield Picture(data, "gif", alt, text)

@@ -48,7 +48,7 @@ MOST_UNSORTED = 12  # groups that are shown in the order of their runs
 STAGES = ("before", "after")  # of a fine-tuning
 IDENTIFIED_FILES = (CART, POLE, RANDOMIZATION)
 TITLES = {"train": "Trainings", "finetune": "Fine-tunings", "evaluate": "Evaluations", "record": "Recordings"}
-MOST_LACKING = 12  # groups that lack seeds, and seeds, that are named one by one
+MOST_LACKING = 12  # groups that lack seeds, seeds, and rejected fine-tunings, that are named one by one
 OVERRIDE = re.compile(r"\+{0,2}([a-z_][\w.]*)=(.*)")  # on a command line
 
 
@@ -288,6 +288,7 @@ def results_of(sweep: Sweep, measure: str) -> Results:
         partly_measured_note((member.run for member, _, _ in kept), measure),
         *_untraced(sweep),
         *_unequal_seeds(sweep),
+        _rejected([member.run.folder.as_posix() for member, _, _ in kept if member.run.kept == STAGES[0]]),
         *(note for _, note in curves.values()),
     ]
     return Results(
@@ -315,7 +316,11 @@ def _agents(kept: Sequence[Kept], measure: str, curves: Mapping[Path, Mapping[st
             ", ".join(member.run.folder.as_posix() for member in own.values()),
             {name: value for each, member in own.items() for name, value in _values(each, member, measure)},
             curves[first.run.folder],
-            folders={each: member.run.folder.as_posix() for each, member in own.items()},
+            folders={
+                name: member.run.folder.as_posix()
+                for each, member in own.items()
+                for name in (each, member.run.kept)  # a fine-tuning has pictures of the policy that it kept
+            },
             seeds=first.seeds,
             source=first.source,
         )
@@ -449,6 +454,16 @@ def _unequal_seeds(sweep: Sweep) -> list[str]:
     named = [f"{label} lacks {_seeds(everything - seeds[label])}" for label in lacking[:MOST_LACKING]]
     more = len(lacking) - MOST_LACKING
     return named if more <= 0 else [*named, f"{more} more groups lack seeds"]
+
+
+def _rejected(runs: Sequence[str]) -> str:
+    """Return a note on fine-tunings that kept the policy before them; empty without any."""
+    more = [f"{len(runs) - MOST_LACKING} more"] if len(runs) > MOST_LACKING else []
+    named = ", ".join([*runs[:MOST_LACKING], *more])
+    note = (
+        f'Rejected fine-tunings: {named}. Their "after" is the policy that was discarded for the one before.'
+    )
+    return note if runs else ""
 
 
 def _seeds(seeds: set[int]) -> str:

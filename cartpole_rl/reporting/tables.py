@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from cartpole_rl.files import replacing
-from cartpole_rl.reporting.runs import DAMAGE, flattened, measured
+from cartpole_rl.reporting.runs import DAMAGE, Run, flattened, measured
 from cartpole_rl.reporting.sweeps import STAGES, Sweep, read_groups, without_repetitions
 from cartpole_rl.run_folder import COMPARISON, METRICS
 
+STAGE_SCORES = {f"score_{stage}": f"{Path(COMPARISON).stem}.{stage}.score" for stage in STAGES}
 BATCH = 10_000  # rows of a Parquet file that are in memory at once
 
 Row = Mapping[str, Hashable]
@@ -24,13 +25,18 @@ def episodes(*sources: str) -> Iterator[dict[str, Hashable]]:
 
 
 def run_rows(sweeps: Sequence[Sweep]) -> Iterator[dict[str, Hashable]]:
-    """Yield a row for each run: its group, differing settings and mean metrics, or why it is left out."""
+    """Yield a row for each run: its group, differing settings and mean metrics, or why it is left out.
+
+    The metrics of a fine-tuning are those of the policy that it `kept`.
+    """
     for sweep in sweeps:
-        results = {member.run.folder: member.run.results for member in sweep.members}
+        results = {member.run.folder: member.run for member in sweep.members}
         for folder, head in _heads(sweep):
-            values = results.get(folder, {})
-            means = {name: value for name in values if (value := measured(values, name)) is not None}
-            yield {**head, **means}
+            run = results.get(folder, Run(folder))
+            names = {**{name: name for name in run.results}, **STAGE_SCORES}
+            means = {name: measured(run.results, key) for name, key in names.items()}
+            found = {name: value for name, value in means.items() if value is not None}
+            yield {**head, **found, **({"kept": run.kept} if run.kept else {})}
 
 
 def episode_rows(sweeps: Sequence[Sweep]) -> Iterator[dict[str, Hashable]]:

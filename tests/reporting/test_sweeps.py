@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.reporting.runs_page import comparison
+from cartpole_rl.reporting.runs_page import Gallery, comparison
 from cartpole_rl.reporting.sweeps import Sweep, grouped, read_groups, read_sweeps, results_of
 from cartpole_rl.reporting.tables import run_rows
 from cartpole_rl.run_folder import file_hash
@@ -247,7 +247,8 @@ def test_a_fine_tuning_is_drawn_before_and_after(study: Path, edit: Edit) -> Non
         folder = study / f"much/{seed}/evaluations/heavy"
         edit(folder / "provenance.json", lambda content: content.update(program="cartpole-finetune"))
         stages = {"before": {MEASURE: {"mean": 1.0 + number}}, "after": {MEASURE: {"mean": 5.0 + number}}}
-        (folder / "comparison.json").write_text(json.dumps(stages))
+        kept = {"kept": "after" if number else "before"}
+        (folder / "comparison.json").write_text(json.dumps(stages | kept))
     (tuned, _), _ = read_groups({"runs": ["quick"]}, MEASURE)
     results = results_of(tuned, MEASURE)
     page = comparison(results, results, {})
@@ -258,6 +259,14 @@ def test_a_fine_tuning_is_drawn_before_and_after(study: Path, edit: Edit) -> Non
         {"before": 1.0, "after": 5.0},
         {"before": 2.0, "after": 6.0},
         {"before": 3.0, "after": 7.0},
+    ]
+    rejected = "Rejected fine-tunings: quick/friction/much/10/evaluations/heavy. "
+    assert any(each.startswith(rejected) for each in results.notes)
+    captions = [each.caption for each in Gallery([results]).pictures(results)]
+    assert captions == [
+        "best: all runs, seed 12, score (6.1) 7.0",
+        "worst: all runs, seed 11, score (6.1) 6.0",
+        "An episode of the worst agent over time (seed 11)",
     ]
 
 

@@ -3,14 +3,18 @@
 import csv
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from command_line import in_process
 
 from cartpole_rl.reporting import tables
-from cartpole_rl.reporting.tables import episodes
+from cartpole_rl.reporting.sweeps import read_groups
+from cartpole_rl.reporting.tables import episodes, run_rows
 
+Edit = Callable[[Path, Callable[[Any], object]], None]
 HEAVY = "much/12/evaluations/heavy"
 
 
@@ -57,13 +61,22 @@ def test_the_tables_have_a_row_for_every_run_and_every_episode(study: Path) -> N
     assert {row["left_out"] for row in found if row["run"] == "quick/zzz_again"} == {again}
 
 
-def test_a_fine_tuning_has_episodes_before_and_after(study: Path) -> None:
+def test_a_fine_tuning_has_episodes_and_scores_before_and_after(study: Path, edit: Edit) -> None:
     folder = study / HEAVY
     metrics = json.loads((folder / "metrics.json").read_text())
-    after = {**metrics, "episodes": metrics["episodes"][:1]}
-    (folder / "comparison.json").write_text(json.dumps({"before": metrics, "after": after, "kept": "after"}))
+    after = {**metrics, "score": {"mean": 5.0}, "episodes": metrics["episodes"][:1]}
+    (folder / "comparison.json").write_text(json.dumps({"before": metrics, "after": after, "kept": "before"}))
     rows = [row for row in episodes("quick") if row["run"] == f"quick/friction/{HEAVY}"]
     assert [(row["stage"], row["episode"]) for row in rows] == [("before", 0), ("before", 1), ("after", 0)]
+    edit(folder / "provenance.json", lambda content: content.update(program="cartpole-finetune"))
+    (run,) = (row for row in run_rows(read_groups({"runs": ["quick"]}, "score")[0]) if row.get("kept"))
+    expected = {
+        "score": metrics["score"]["mean"],
+        "score_before": metrics["score"]["mean"],
+        "score_after": 5.0,
+    }
+    assert {name: run[name] for name in expected} == expected
+    assert (run["run"], run["kept"]) == (f"quick/friction/{HEAVY}", "before")
 
 
 def test_parquet_holds_what_csv_holds(study: Path, monkeypatch: pytest.MonkeyPatch) -> None:
