@@ -47,7 +47,10 @@ MOST_MEASURES = 20  # in a message
 MOST_UNSORTED = 12  # groups that are shown in the order of their runs
 STAGES = ("before", "after")  # of a fine-tuning
 IDENTIFIED_FILES = (CART, POLE, RANDOMIZATION)
-TITLES = {"train": "Trainings", "finetune": "Fine-tunings", "evaluate": "Evaluations", "record": "Recordings"}
+TITLES = {
+    **{"train": "Trainings", "finetune": "Fine-tunings", "distill": "Distillations"},
+    **{"evaluate": "Evaluations", "record": "Recordings", "identify": "Identifications", "model": "Models"},
+}
 MOST_LACKING = 12  # groups that lack seeds, seeds, and rejected fine-tunings, that are named one by one
 OVERRIDE = re.compile(r"\+{0,2}([a-z_][\w.]*)=(.*)")  # on a command line
 
@@ -156,13 +159,11 @@ def _by_command(sweep: Sweep) -> list[Sweep]:
     members: dict[str, list[Member]] = {}
     for member in sweep.members:
         members.setdefault(member.run.program, []).append(member)
-    if len(members) < 2:
-        return [sweep]
     ordered = sorted(members, key=lambda program: [*USES, program].index(program))
     return [
         replace(sweep, name=program, members=members[program], exclusions=() if number else sweep.exclusions)
         for number, program in enumerate(ordered)
-    ]
+    ] or [sweep]
 
 
 def _folders(name: str, sources: Sequence[str]) -> list[Path]:

@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ def cells(page: str, column: str) -> list[str]:
 def read_sweep(name: str, sources: list[str], measure: str) -> Sweep:
     """The runs of one set."""
     (sweep,) = read_sweeps({name: sources}, measure)
-    return sweep
+    return replace(sweep, name=name)
 
 
 def test_runs_are_grouped_by_the_settings_that_differ(study: Path) -> None:
@@ -279,7 +280,7 @@ def test_fine_tunings_of_one_agent_are_told_apart_by_their_own_seeds(study: Path
         (folder / "comparison.json").write_text("{}")
     (tuned,), _ = read_groups({"runs": ["quick/friction/much/*/evaluations/heavy"]}, MEASURE)
     results = results_of(tuned, MEASURE)
-    assert results.exclusions == ()
+    assert (results.title, results.exclusions) == ("Fine-tunings", ())
     assert [agent.seed_text for agent in results.agents] == [f"{n} (agent 10)" for n in (10, 11, 12)]
     assert [(row["seed"], row["agent_seed"]) for row in run_rows([tuned])] == [(10, 10), (11, 10), (12, 10)]
 
