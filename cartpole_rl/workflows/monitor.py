@@ -77,7 +77,7 @@ class TrainingMonitor(Monitor):
             self._log_pictures(episodes[0], transitions)
         score = record[self.config.task.measure]
         if self._view:
-            name = f"{transitions / 1e6:.2f} M transitions: mean score {score:z.0f}"
+            name = f"{transitions / 1e6:.2f} M transitions: mean {self.config.task.measure} {score:z.0f}"
             self._view.add(columns(name, episodes[0], self.config.task.x_max))
         agent = AgentCheckpoint(self._settings, training.agent.state_dict(), transitions, score)
         for name in (LAST, BEST) if is_best else (LAST,):

@@ -127,7 +127,7 @@ def fall_note(scores: Sequence[float]) -> str | None:
     if best < LEAST or scores[-1] >= FALLEN * best:
         return None
     return (
-        f"note: the last evaluation scored {scores[-1]:.0f}, the best {best:.0f}: the agent became worse; "
+        f"note: the last evaluation scored {scores[-1]:z.0f}, the best {best:.0f}: the agent became worse; "
         f"{CHECKPOINTS}/{BEST} is the best one, but train again with another seed"
     )
 

@@ -126,6 +126,7 @@ def test_a_track_beyond_the_soft_limit_is_noted(capsys: pytest.CaptureFixture[st
 def test_a_training_that_became_worse_says_so() -> None:
     assert fall_note([100, 9077, 8200]) is None
     assert "scored 1248, the best 9077" in str(fall_note([100, 9077, 1248]))
+    assert "scored 0," in str(fall_note([9077, -0.2]))
     assert fall_note([-1.0, -2.0]) is None  # it never scored
     assert fall_note([1.0, 0.1]) is None  # nor did this one
     assert fall_note([]) is None

@@ -184,10 +184,12 @@ def test_a_training_shows_the_first_episode_of_each_evaluation(
 
     monkeypatch.setattr(WebView, "add", added)
     toy = {**TOY[TrainConfig], "learning.evaluations": 2, "task.time_limit": 50, "view": "web"}
+    toy |= {"task.angle_limit": 10.0}  # it judges by score_upright
     train(load_settings(TrainConfig, toy), tmp_path / "run")
     history = [json.loads(line) for line in (tmp_path / "run/history.jsonl").read_text().splitlines()]
     assert [each["name"] for each in shown] == [
-        f"{each['transitions'] / 1e6:.2f} M transitions: mean score {each['score']:z.0f}" for each in history
+        f"{each['transitions'] / 1e6:.2f} M transitions: mean score_upright {each['score_upright']:z.0f}"
+        for each in history
     ]
     assert {len(each["theta"]) for each in shown} == {51}
 
