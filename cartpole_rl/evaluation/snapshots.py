@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 
 COUNTER = struct.Struct("<Q")
-FIELDS = struct.Struct("<2I 2i 2Q 6d")  # a jump of the cart's tick can add 2^32 lost frames at once
+FIELDS = struct.Struct("<2I 2i 2Q 7d")  # a jump of the cart's tick can add 2^32 lost frames at once
 SIZE = COUNTER.size + FIELDS.size
 ATTEMPTS = 10  # to read while the writer writes
 
@@ -39,6 +39,7 @@ class Snapshot(NamedTuple):
     theta_dot: float  # rad/s
     score: float  # sum of equation (6.2) so far
     track_half_length: float  # m
+    pole: float  # its length, m; 0 on a cart that does not know it
 
 
 def new_memory() -> Memory:
@@ -82,7 +83,7 @@ class Publisher:
     def __init__(self, env: "CartPoleEnv", memory: Memory, row: int = 0) -> None:
         self._env, self._memory, self._row = env, memory, row
         self._written = self._episode = 0
-        self._score = self._track_half_length = 0.0
+        self._score = self._track_half_length = self._pole = 0.0
         self._ended = False
 
     def on_command(self, motor: int) -> None:
@@ -101,6 +102,7 @@ class Publisher:
         step = int(cart["step_count"])
         if step == 0:
             self._due, self._ended = time.monotonic(), False
+            self._pole = float(self._env.plant.pole_length[self._row])
         if self._ended:
             return
         motor = int(self._env.hardware.sent_motors(cart["action"].reshape(1), cart["guard"]))
@@ -117,5 +119,5 @@ class Publisher:
         self._score += score
         self._written += 1
         present = self._episode, step, motor, guard, statistics.late_ticks, statistics.lost_frames
-        snapshot = (*present, *state, self._score, self._track_half_length)
+        snapshot = (*present, *state, self._score, self._track_half_length, self._pole)
         write(self._memory, self._written, Snapshot._make(snapshot))

@@ -4,6 +4,7 @@ All frames share a fixed palette of at most 32 colours, so that a frame stores o
 """
 
 import io
+import math
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from itertools import accumulate
@@ -18,7 +19,7 @@ from cartpole_rl.files import replacing
 from cartpole_rl.reporting.texts import ending_text
 from cartpole_rl.tasks.episode import Ending, Episode
 
-EVERY = 2  # control periods between frames: 25 frames a second at 50 Hz
+EVERY = 2  # control periods between frames, at least: 25 frames a second at 50 Hz
 LAST_FRAME = 1000  # ms, of the last frame before the animation repeats
 SHORTEST = 20  # ms; browsers slow down a frame that claims less
 MILLISECOND = Fraction(1, 1000)  # s
@@ -41,7 +42,7 @@ def write_animation(path: Path, pictures: Sequence[Image.Image], times: Sequence
 def gif(episode: Episode, pole_length: float, track_half_length: float) -> bytes:
     """Return the episode as the bytes of an endless GIF in real time that pauses on its last frame.
 
-    `pole_length` (pivot to tip) and `track_half_length` in m.
+    `pole_length` (pivot to tip) and `track_half_length` in m; an episode that knows its own pole shows that.
     """
     return encoded_gif([*frames(episode, pole_length, track_half_length)], durations(episode))
 
@@ -62,7 +63,7 @@ def drawn(
     """Return the drawing of an episode; its time bar spans `duration` s, or the episode."""
     ending = "" if episode.ended_by == Ending.TIME else ending_text(episode)
     course = Course(episode.time, episode.x, episode.theta, episode.motor, episode.score)
-    return CartDrawing.of(course, pole_length, track_half_length, duration, ending)
+    return CartDrawing.of(course, episode.pole_length or pole_length, track_half_length, duration, ending)
 
 
 def picture(drawing: CartDrawing, background: Image.Image, row: int) -> Image.Image:
@@ -73,8 +74,10 @@ def picture(drawing: CartDrawing, background: Image.Image, row: int) -> Image.Im
 
 
 def rows(episode: Episode) -> list[int]:
-    """Return the rows of the state that become frames: each EVERY-th, and the last."""
-    chosen = list(range(0, episode.steps + 1, EVERY))
+    """Return the rows of the state that become frames, SHORTEST or more apart, and the last."""
+    period = max(1000 * float(np.median(np.diff(episode.time))), 1.0)  # ms; 0 where the link was lost at once
+    every = max(EVERY, math.ceil(round(SHORTEST / period, 1)))
+    chosen = list(range(0, episode.steps + 1, every))
     return chosen if chosen[-1] == episode.steps else [*chosen, episode.steps]
 
 

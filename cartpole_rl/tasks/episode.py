@@ -77,6 +77,11 @@ class Episode:
         return self.counts * np.array(self.encoders.resolution)
 
     @property
+    def pole_length(self) -> float | None:
+        """The length of a uniform rod with its pole's centre of mass, m; None where that is not known."""
+        return 2 * self.origin.parameters["pole_com"] if self.origin else None
+
+    @property
     def measured_steps(self) -> int:
         """Number of control periods whose outcome was measured: all but the last one before a lost link."""
         return self.steps - (self.ended_by == "link")

@@ -10,17 +10,18 @@ import torch
 from tensordict import TensorDictBase
 
 from cartpole_rl.emulator.settings import EmulatorSettings
-from cartpole_rl.envs.build import environment, shipped_settings
+from cartpole_rl.envs.build import environment, shipped_settings, simulated_env
 from cartpole_rl.evaluation.episodes import run_episodes
 from cartpole_rl.evaluation.snapshots import COUNTER, Memory, Snapshot, followed, new_memory, read, write
 from cartpole_rl.plants.serial.plant import emulated_plant
+from cartpole_rl.workflows.config import TrainConfig, load_settings
 
 ENOUGH = 200  # different snapshots
 
 
 def numbered(number: int) -> Snapshot:
     """A snapshot whose fields all say which one it is."""
-    return Snapshot(*[number] * 6, *[float(number)] * 6)
+    return Snapshot(*[number] * 6, *[float(number)] * 7)
 
 
 def full_left(current: TensorDictBase) -> TensorDictBase:
@@ -88,3 +89,15 @@ def test_a_driven_cart_publishes_what_the_episode_holds() -> None:
     assert snapshot.score == pytest.approx(episode.score[:-1].sum(), rel=1e-5)
     assert snapshot.late_ticks == plant.cart.statistics.late_ticks
     assert snapshot.track_half_length == pytest.approx(0.38, abs=0.01)
+    assert snapshot.pole == 0.0  # a cart on a port does not know it
+
+
+def test_a_simulated_cart_publishes_the_pole_that_it_drew() -> None:
+    settings = load_settings(TrainConfig, {"pole": "range", "task.time_limit": 3})
+    with closing(simulated_env(settings, settings.plant, 1, settings.task.start, seed=1)) as env:
+        memory = new_memory()
+        followed(env, memory)
+        (episode,) = run_episodes(env, full_left, 1)
+        _, snapshot = read(memory)
+    assert snapshot.pole == pytest.approx(episode.pole_length)
+    assert snapshot.pole != pytest.approx(settings.pole.nominal.length)

@@ -20,7 +20,7 @@ from cartpole_rl.reporting.animation import (
     side_by_side,
     write_animation,
 )
-from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.tasks.episode import Episode, Origin
 
 POLE, TRACK = 0.3365, 0.407  # m
 
@@ -96,6 +96,17 @@ def test_the_arrow_points_where_the_motor_pushes_and_is_longer_for_a_stronger_pu
         assert np.all(np.sign(arrow[:, 0] - SIZE[0] / 2) == np.sign(motor))
         widths[motor] = np.ptp(arrow[:, 0])
     assert widths[250] - widths[100] == pytest.approx(150 / 255 * 70, abs=2)
+
+
+def test_the_pole_is_that_of_the_episode_where_it_is_known(swing_up: Episode) -> None:
+    known = dataclasses.replace(swing_up, origin=Origin({"pole_com": POLE / 2}, {}))
+    assert next(frames(known, 2 * POLE, TRACK)) == first(swing_up)
+
+
+@pytest.mark.parametrize("period", [0.02, 0.01, 0.008, 0.005, 0.001])
+def test_any_control_period_is_shown_in_real_time(swing_up: Episode, period: float) -> None:
+    waits = durations(dataclasses.replace(swing_up, time=swing_up.time / 0.02 * period))
+    assert sum(waits[:-1]) == pytest.approx(500 * 1000 * period, abs=10)
 
 
 def test_jitter_does_not_accumulate(balance: Episode) -> None:

@@ -24,7 +24,7 @@ from cartpole_rl.workflows.config import TrainConfig, load_settings
 from cartpole_rl.workflows.train import train
 
 pytestmark = pytest.mark.usefixtures("without_pictures")
-CALM = Snapshot(2, 120, -100, 0, 0, 1, 0.19, -0.25, 0.01, 0.5, 812.4, 0.38)
+CALM = Snapshot(2, 120, -100, 0, 0, 1, 0.19, -0.25, 0.01, 0.5, 812.4, 0.38, 0.34)
 EPISODE = {
     "name": "episode_000",
     "track": 0.38,
