@@ -217,21 +217,28 @@ def _summary(episode: Episode) -> str:
 
 
 def columns(name: str, episode: Episode, track: float, ghost: Array | None = None) -> dict[str, Any]:
-    """Return what the page of `view=web` shows of an episode on a track of +-`track` m.
+    """Return what the page of `view=web` shows of an episode on a track of +-`track` m; None if not finite.
 
     `ghost` [2, T + 1] has the positions, m, and angles, rad, of a cart beside it, NaN where there is none.
     """
     rows = len(episode.time)
     guarded = episode.guarded if episode.guarded is not None else np.zeros(episode.steps)
     beside = np.full((2, rows), np.nan) if ghost is None else ghost
+    motor = episode.motor.tolist()
     steps = {
-        "motor": [*episode.motor.tolist(), 0],
+        "motor": [*motor, motor[-1]],
         "guard": [*(np.sign(episode.motor) * guarded).astype(int).tolist(), 0],
-        "score": [0.0, *episode.score.cumsum().round(1).tolist()],
     }
-    series = {"x": episode.x, "theta": episode.theta, "ghost_x": beside[0], "ghost_theta": beside[1]}
+    series = {
+        "x": episode.x,
+        "theta": episode.theta,
+        "ghost_x": beside[0],
+        "ghost_theta": beside[1],
+        "score": [0.0, *episode.score.cumsum().round(1)],
+    }
     rounded = {
-        name: [None if np.isnan(value) else round(float(value), 5) for value in values]
+        name: [round(float(value), 5) if np.isfinite(value) else None for value in values]
         for name, values in series.items()
     }
-    return {"name": name, "track": track, "time": episode.time.tolist(), **rounded, **steps}
+    about = {"name": name, "track": track, "pole": episode.pole_length}
+    return {**about, "time": episode.time.tolist(), **rounded, **steps}

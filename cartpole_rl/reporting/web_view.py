@@ -12,6 +12,7 @@ import json
 import math
 import multiprocessing
 import os
+import re
 import secrets
 import signal
 import socket
@@ -37,6 +38,8 @@ LONGEST_BODY = 1000  # bytes of a request; that of the button is empty
 LESS_URGENT = 10  # niceness: below the driving process, but the button answers on a busy computer, too
 NOTE = "by the button of the page"
 STOPPED = "Stop is sent: the motor goes to 0. The terminal says what was kept."
+TRAINING_STOPPED = "The training stops; the terminal says what was kept."
+CLOSED = "Closed."
 HEADERS = {
     "Cache-Control": "no-store",
     "Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; "
@@ -76,7 +79,8 @@ class WebView:
         receiver, self._sender = context.Pipe(duplex=False)
         shown = page(title, pole_length, self.memory is None, grows)
         ignored = signal.getsignal(signal.SIGINT) == signal.SIG_IGN  # as a shell's & leaves it
-        stop = Stop(os.getpid(), signal.SIGTERM if ignored else signal.SIGINT, self._stopped)
+        answer = STOPPED if self.memory else TRAINING_STOPPED if grows else CLOSED
+        stop = Stop(os.getpid(), signal.SIGTERM if ignored else signal.SIGINT, self._stopped, answer)
         arguments = (self._listener, self._secret, shown, [*(episodes or ())], receiver, self.memory, stop)
         self._process = context.Process(target=serve, args=arguments, daemon=True)
 
@@ -120,10 +124,13 @@ def page(title: str, pole_length: float, replays: bool, grows: bool = False) -> 
 
 
 class Stop:
-    """What interrupts the process that started this one, which then sets the motor to 0 and reports."""
+    """What interrupts the process that started this one, which then sets the motor to 0 and reports.
 
-    def __init__(self, process: int, number: int, stopped: Any) -> None:
-        self.process, self._number, self._stopped = process, number, stopped
+    `answer` is what the page says then.
+    """
+
+    def __init__(self, process: int, number: int, stopped: Any, answer: str) -> None:
+        self.process, self._number, self._stopped, self.answer = process, number, stopped, answer
 
     def __call__(self) -> None:
         """Send the signal, unless that process has ended."""
@@ -145,20 +152,22 @@ def serve(
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
     end_with_parent(stop.process)
     lose_precedence(LESS_URGENT)
-    contents = {"": shown, "recording": json.dumps(episodes)}
+    recording = [*map(json.dumps, episodes)]
 
     def receive() -> None:
         with suppress(EOFError, OSError):
             while True:
-                episodes.append(added.recv())
-                contents["recording"] = json.dumps(episodes)
+                recording.append(json.dumps(added.recv()))
 
     threading.Thread(target=receive, daemon=True).start()
-    Server(listener, secret, contents, memory, stop).serve_forever()
+    Server(listener, secret, shown, recording, memory, stop).serve_forever()
 
 
 class Server(ThreadingHTTPServer):
-    """Answers on `listener` with `contents` and the newest snapshot, below the path /`secret`/."""
+    """Answers below the path /`secret`/ with the page `shown`, the newest snapshot, or episodes as JSON.
+
+    `recording` has a text for each episode; a process that serves a training appends them.
+    """
 
     daemon_threads = True
 
@@ -166,14 +175,16 @@ class Server(ThreadingHTTPServer):
         self,
         listener: socket.socket,
         secret: str,
-        contents: dict[str, str],
+        shown: str,
+        recording: list[str],
         memory: Memory | None,
         stop: Stop,
     ) -> None:
         super().__init__(listener.getsockname(), Handler, bind_and_activate=False)
         self.socket.close()
         self.socket = listener
-        self.secret, self.contents, self.memory, self.stop = secret, contents, memory, stop
+        self.secret, self.shown, self.recording = secret, shown, recording
+        self.memory, self.stop = memory, stop
 
     def newest(self) -> str:
         """Return the newest snapshot and its number as JSON; null for a number that is not finite."""
@@ -195,13 +206,16 @@ class Handler(BaseHTTPRequestHandler):
     server: Server
 
     def do_GET(self) -> None:
-        """Answer with the page, the recording, or the newest snapshot."""
+        """Answer with the page, the newest snapshot, or the episodes from number n on: recording?from=n."""
         name = self.wanted()
-        if name == "now":
+        known = re.fullmatch(r"recording\?from=(\d{1,9})", name or "", re.ASCII)
+        if name == "":
+            self.answer(200, self.server.shown, "text/html")
+        elif name == "now":
             self.answer(200, self.server.newest(), "application/json")
-        elif name in self.server.contents:
-            kind = "application/json" if name else "text/html"
-            self.answer(200, self.server.contents[name], kind)
+        elif known:
+            episodes = self.server.recording[int(known[1]) :]
+            self.answer(200, f"[{','.join(episodes)}]", "application/json")
         elif name is not None:
             self.answer(404, "There is nothing here.")
 
@@ -217,8 +231,9 @@ class Handler(BaseHTTPRequestHandler):
         if name is not None and origin not in (None, f"http://{self.headers['Host']}"):
             self.answer(403, "Another page asked.")
         elif name == "stop":
+            text = f'<meta name="color-scheme" content="light dark">{self.server.stop.answer}'
             try:  # first: the parent ends this process
-                self.answer(200, f'<meta name="color-scheme" content="light dark">{STOPPED}', "text/html")
+                self.answer(200, text, "text/html")
             finally:
                 self.server.stop()
         elif name is not None:

@@ -1,6 +1,7 @@
 """The figure of an episode shows it in the units that its axes name; a learning curve has mean and band."""
 
 import dataclasses
+import json
 import math
 
 import numpy as np
@@ -10,9 +11,9 @@ from hypothesis import strategies as st
 from matplotlib.patches import StepPatch
 
 from cartpole_rl.drawing import colours
-from cartpole_rl.reporting.episodes import behaviour, learning_curve, wrapped_line
+from cartpole_rl.reporting.episodes import behaviour, columns, learning_curve, wrapped_line
 from cartpole_rl.reporting.style import series_colour
-from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.tasks.episode import Episode, Origin
 
 TRACK = 0.407  # m
 
@@ -71,6 +72,18 @@ def test_a_wrapped_line_never_jumps(steps: list[float], start: float, wrapped: b
     longest = np.degrees(np.abs(np.diff(theta)).max())
     assert np.all(drawn[np.isfinite(drawn)] <= longest + 1e-6)
     assert np.all(np.diff(times) >= -1e-12)
+
+
+def test_the_page_of_an_episode_gets_its_pole_its_last_motor_value_and_no_number_that_is_not_finite(
+    swing_up: Episode,
+) -> None:
+    theta, score = swing_up.theta.copy(), swing_up.score.copy()
+    theta[-1], score[-1] = math.inf, math.nan
+    origin = Origin({"pole_com": 0.2}, {})
+    shown = columns("name", dataclasses.replace(swing_up, theta=theta, score=score, origin=origin), TRACK)
+    json.dumps(shown, allow_nan=False)
+    assert (shown["theta"][-1], shown["score"][-1]) == (None, None)
+    assert (shown["motor"][-1], shown["pole"]) == (swing_up.motor[-1], 0.4)
 
 
 def records(scores: list[float], transitions_apart: int = 100_000) -> list[dict]:

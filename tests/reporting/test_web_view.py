@@ -106,13 +106,15 @@ def test_it_answers_its_own_computer_alone() -> None:
 def press(address: str) -> None:
     """Press the button until it interrupts: Python loses an interrupt that comes in a destructor."""
     for _ in range(20):
-        ask(address, "POST", "stop")
+        assert "motor" not in ask(address, "POST", "stop")[1]  # there is none
         time.sleep(5)
 
 
 def test_a_recording_is_shown_until_it_is_closed() -> None:
     with WebView("Replay", 0.36, [EPISODE]) as view:
-        assert json.loads(ask(view.address, "GET", "recording")[1]) == [EPISODE]
+        assert json.loads(ask(view.address, "GET", "recording?from=0")[1]) == [EPISODE]
+        assert json.loads(ask(view.address, "GET", "recording?from=1")[1]) == []
+        assert ask(view.address, "GET", "recording?from=x")[0] == 404
         with pytest.raises(KeyboardInterrupt):
             press(view.address)
 
@@ -132,6 +134,11 @@ setInterval(() => {
 
 
 NEWEST = """<script>
+let seen = 0;
+for (const [number, episode, step] of [[1, 1, 60], [1, 1, 60], [2, 1, 61], [3, 2, 200]]) {
+  follow({ number, snapshot: { episode, step, x: 0, theta: 0, motor: 0, guard: 0, score: 0 } });
+  if (points.length !== [1, 1, 2, 1][seen++]) throw new Error("the trace mixes episodes");
+}
 setInterval(() => { if (element("state").textContent === "the second") element("stop").click(); }, 10);
 </script></body>"""
 
@@ -149,7 +156,7 @@ def add_before_a_browser(folder: Path) -> None:
     """Add two episodes to a page that a browser shows, and wait for its button."""
     with WebView("Training", 0.36, (), grows=True) as view, open_browser(view, folder):
         view.add({**EPISODE, "name": "the first"})
-        while "the first" not in ask(view.address, "GET", "recording")[1]:
+        while "the first" not in ask(view.address, "GET", "recording?from=0")[1]:
             time.sleep(0.01)
         view.add({**EPISODE, "name": "the second"})
         time.sleep(100)
@@ -178,7 +185,7 @@ def test_a_training_shows_the_first_episode_of_each_evaluation(
 
     def added(view: WebView, episode: dict[str, Any]) -> None:
         add(view, episode)
-        while len(found := json.loads(ask(view.address, "GET", "recording")[1])) == len(shown):
+        while len(found := json.loads(ask(view.address, "GET", "recording?from=0")[1])) == len(shown):
             time.sleep(0.01)
         shown.append(found[-1])
 
