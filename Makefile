@@ -1,5 +1,7 @@
 # One target for each check; `make check` runs them all and is what CI runs.
 BIN := .venv/bin
+# keep bytecode: the tests start hundreds of processes, each of which would compile the package again
+export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: check lint types floors test nightly docs format
 
