@@ -238,7 +238,7 @@ class TrackLimits:
         return self._jumped(self._poles, FASTEST_POLE * self._turn)
 
     def _jumped(self, counts: deque[int], fastest: int) -> bool:
-        if self._fresh < self._samples:
+        if self._look_us or self._fresh < self._samples:  # of a few measurements, each period tells as much
             return False
         return is_too_fast(counts[-1] - counts[0], self._us[-1] - self._us[0], fastest)
 

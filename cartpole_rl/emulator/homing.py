@@ -218,7 +218,7 @@ class HeldWatch:
         ran, fast = direction * self._ran, pole_speed(before, reading) > self._fast
         moved = reading.cart - before.cart
         way = (ran - HARDEST_STOP / 2 * reading.seconds) * reading.seconds  # m
-        runs_on = travels and not fast and ran >= RUNS and way > 2 * self._stands * self._metres
+        runs_on = travels and not fast and ran >= RUNS and way > (2 * self._stands + 1) * self._metres
         self._ran = 0.0 if fast else moved * self._metres / reading.seconds
         self.window.add(reading.cart, reading.us)
         pushed = motor == direction * self._full_push and self.window.spread <= self._stands

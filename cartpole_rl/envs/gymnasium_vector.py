@@ -57,11 +57,12 @@ class CartPoleVector(Carts, VectorEnv[Array, Array, Array], EzPickle):
             raise ConfigError(f"seed={seed}: give one integer, which seeds all carts")
         super().reset(seed=seed)
         self.seed_plant(seed)
-        chosen = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool)))
+        mask = (options or {}).get("reset_mask")
+        chosen = np.ones(self.num_envs, dtype=bool) if mask is None else np.asarray(mask)
         if chosen.dtype != bool or chosen.shape != (self.num_envs,) or not chosen.any():
             raise ConfigError(f"reset_mask: give {self.num_envs} booleans, of which one is True at least")
         if self._present is None or chosen.all():
-            self._present = self.env.reset()
+            chosen, self._present = np.ones_like(chosen), self.env.reset()
         else:
             rows = torch.as_tensor(chosen).unsqueeze(1)
             self._present = self.env.reset(self._present.set("_reset", rows))

@@ -40,7 +40,7 @@ class QAgent(nn.Module):
         super().__init__()
         self.settings = settings
         network = settings.network(settings, mirror_signs, actions, frames)
-        check_network(settings.network, network, len(mirror_signs), actions)
+        self.check_network(network, len(mirror_signs), actions)
         network = network.to(device)
         self.actor = QValueActor(network, in_keys=["observation"], spec=Categorical(actions))
         self.loss = self.make_loss()
@@ -54,6 +54,10 @@ class QAgent(nn.Module):
         networks = online, target, TensorDict.from_module(self.greedy_policy())
         weights = [TensorDict({name: network[name] for name in trainable}).lock_() for network in networks]
         self._online, self._target, self._average = weights
+
+    def check_network(self, network: Any, observation_size: int, actions: int) -> None:
+        """Raise ConfigError for a network that cannot drive; a kind with other outputs replaces this."""
+        check_network(self.settings.network, network, observation_size, actions)
 
     def make_loss(self) -> DQNLoss:
         """Return the loss of the actor; a subclass may take another one."""
@@ -107,7 +111,7 @@ def check_network(name: str, network: Any, observation_size: int, actions: int) 
     try:
         with torch.random.fork_rng(devices=[]):
             tried = copy.deepcopy(network)
-            for weight in tried.parameters():
+            for weight in filter(Tensor.is_floating_point, tried.parameters()):
                 weight.add_(0.1 * torch.randn(weight.shape, generator=generator))
             training, driving, one = (copy.deepcopy(tried).train(each) for each in (True, False, False))
             values, driven, alone = training(observations), driving(observations), one(observations[:1])
@@ -121,8 +125,8 @@ def check_network(name: str, network: Any, observation_size: int, actions: int) 
             f"give action values [{TRIED}, {actions}]"
         )
     alike = partial(torch.allclose, rtol=1e-3, atol=1e-3, equal_nan=True)
-    moved = not all(map(torch.equal, training.buffers(), network.buffers()))
-    if moved or not alike(values, driven) or not alike(values[:1], alone):
+    pairs = [(values, driven), (values[:1], alone), *zip(training.buffers(), tried.buffers(), strict=True)]
+    if not all(alike(one.double(), other.double()) for one, other in pairs):
         raise ConfigError(
             f"{said} it acts otherwise in training than afterwards, as Dropout and BatchNorm do; use "
             "LayerNorm, or leave them out"

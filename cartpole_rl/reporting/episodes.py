@@ -226,7 +226,7 @@ def columns(name: str, episode: Episode, track: float, ghost: Array | None = Non
     beside = np.full((2, rows), np.nan) if ghost is None else ghost
     motor = episode.motor.tolist()
     steps = {
-        "motor": [*motor, motor[-1]],
+        "motor": [*motor, *(motor[-1:] or [0])],
         "guard": [*(np.sign(episode.motor) * guarded).astype(int).tolist(), 0],
     }
     series = {

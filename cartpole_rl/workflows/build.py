@@ -227,13 +227,14 @@ def evaluated_settings(training: TrainConfig, config: EvaluateConfig) -> CartPol
 
     A new guard is fitted to the carts that `config` randomizes, or else to those of the training: an
     evaluation without randomization may drive a real cart. The guard of the training is fitted anew to the
-    settings that make it `outdated`. Raises ConfigError.
+    settings that make it `outdated`. On plant=learned, either is fitted to the carts of the model. Raises
+    ConfigError.
     """
     settings = replaced_settings(training, config)
     fitted_to = settings.model_copy(update={"randomization": config.randomization or training.randomization})
     if changes := outdated(training, config):
         fitted_to = with_guard_numbers(training, None).model_copy(update=changes)
-    return settings.model_copy(update={"guard": with_fitted_guard(fitted_to).guard})
+    return settings.model_copy(update={"guard": with_fitted_guard(fitted_to, config.plant).guard})
 
 
 def outdated(training: TrainConfig, config: EvaluateConfig) -> dict[str, Any]:

@@ -135,9 +135,7 @@ def prepared(config: EvaluateConfig) -> Evaluation:
         config = again.config
     use_threads(config.threads)
     seed_everything(config.seed)
-    agent = evaluated_agent(config)
-    file = agent_file(config.run)
-    content = file.read_bytes() if file else None
+    agent, content = loaded_agent(config)
     training = compiled_training(agent) if config.plant.has_compiled_agent else agent.training
     settings = evaluated_settings(training, config)
     simulation = (
@@ -160,6 +158,20 @@ def prepared(config: EvaluateConfig) -> Evaluation:
         on_board,
         content,
     )
+
+
+def loaded_agent(config: EvaluateConfig) -> tuple[TrainedAgent, bytes | None]:
+    """Return the agent, and the content of its file, if it has one. Raises CheckpointError, ConfigError.
+
+    Both are of one version of the file, which a training that goes on replaces now and then.
+    """
+    file = agent_file(config.run)
+    while True:
+        version = file.stat().st_mtime_ns if file else 0
+        agent = evaluated_agent(config)
+        content = file.read_bytes() if file else None
+        if not file or file.stat().st_mtime_ns == version:
+            return agent, content
 
 
 def repeated(env: CartPoleEnv, policy: Policy, again: Repetition, knocks: Knocks | None) -> Iterator[Episode]:

@@ -145,7 +145,7 @@ static bool is_held(cart_homing *homing, const cart_reading *reading, int direct
 {
     double ran = direction * homing->ran, time = seconds(reading);
     bool fast = pole_speed(homing, reading) > FAST_POLE;
-    bool runs_on = travels && !fast && ran >= RUNS && (ran - HARDEST_STOP / 2 * time) * time > 2 * STANDS_COUNTS * CART_METRES;
+    bool runs_on = travels && !fast && ran >= RUNS && (ran - HARDEST_STOP / 2 * time) * time > (2 * STANDS_COUNTS + 1) * CART_METRES;
     bool stopped = runs_on && cart_distance(reading->cart, homing->before.cart) <= STANDS_COUNTS;
     homing->ran = fast ? 0 : speed;
     homing->before = *reading;

@@ -1,10 +1,12 @@
-"""The window of homing covers its whole time, even if a period was late or early."""
+"""The window of homing covers its whole time, even if a period was late or early; a held cart is seen."""
 
 import math
+from itertools import pairwise
 
 import pytest
 
-from cartpole_rl.emulator.homing import Window
+from cartpole_rl.emulator.homing import HeldWatch, Reading, Window
+from cartpole_rl.rig.hardware import nominal_hardware
 
 LENGTH = 400_000  # us
 PERIOD = 20_000
@@ -32,3 +34,21 @@ def test_a_late_period_does_not_fill_it_early(late: int) -> None:
 def test_a_short_period_does_not_fill_it_early() -> None:
     periods = [PERIOD] * 5 + [PERIOD // 2] + [PERIOD] * 40
     assert sum(periods[1 : filled(periods).index(True) + 1]) >= LENGTH
+
+
+@pytest.mark.parametrize(
+    ("nanometres", "counts", "held"),  # 15 ms apart
+    [
+        (1_000_000, (0, 3, 6, 7), False),  # 0.12 m/s may look so
+        (22_750, (0, 132, 264, 300), False),
+        (22_750, (0, 132, 264, 264), True),
+        (22_750, (0, -132, -264, -264), False),  # it ran the other way
+    ],
+)
+def test_a_travelling_cart_that_stops_at_once_is_held(
+    nanometres: int, counts: tuple[int, ...], held: bool
+) -> None:
+    watch = HeldWatch(nominal_hardware().model_copy(update={"cart_nanometres_per_count": nanometres}))
+    readings = [Reading(count, 0, 15_000) for count in counts]
+    found = [watch.is_held(*pair, direction=1, motor=0, travels=True) for pair in pairwise(readings)]
+    assert found == [False, False, held]

@@ -196,12 +196,14 @@ def test_one_cart_is_reset_first() -> None:
 
 
 def test_many_carts_are_reset_first_and_take_one_seed() -> None:
-    envs = gymnasium.make_vec("cartpole_rl/SwingUp-v0", num_envs=2, vectorization_mode="vector_entry_point")
+    envs = vector("cartpole_rl/SwingUp-v0", carts=2, render_mode="rgb_array")
     with pytest.raises(gymnasium.error.ResetNeeded):
         envs.step(np.zeros(2, int))
     with pytest.raises(ConfigError, match=r"seed=\[1, 2\]: give one integer"):
         envs.reset(seed=[1, 2])  # type: ignore[arg-type]
-    before = envs.reset(seed=3)[0]
+    envs.reset(options={"reset_mask": np.array([False, True])})  # the first one is of all
+    assert len(envs.render()) == 2
+    before = envs.reset(seed=3, options={"reset_mask": None})[0]
     for mask in ([True], np.zeros(2, bool), np.ones(2)):
         with pytest.raises(ConfigError, match="reset_mask: give 2 booleans, of which one is True at least"):
             envs.reset(options={"reset_mask": mask})

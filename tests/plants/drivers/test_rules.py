@@ -353,12 +353,13 @@ def test_a_pole_that_turns_back_in_the_dead_zone_is_kept_in_it(period_us: int) -
     """It comes out where it went in, after 0.16 s; the estimate is at most the zone away."""
     bridge = Playing(pole_range=[LOW, HIGH])
     bridge._board_us = period_us
+    bridge._stand_in.armed = bridge._stand_in.homed = True
     times = [0.17 * each / (170_000 // period_us) for each in range(170_000 // period_us)]
     true = [3840 + 2400 * t - 15_000 * t * t for t in times]
     seen = seen_from_start(bridge, true, period_us=period_us)
     assert max(seen) <= 4096 + LOW - 3840
     assert seen[-1] == pytest.approx(true[-1] - true[0], abs=1)
-    assert bridge.played.bad == 0
+    assert (bridge.played.bad, bridge._stand_in.fault) == (0, 0)
 
 
 def test_noise_at_the_edge_of_the_dead_zone_carries_no_pole_out_of_it() -> None:
