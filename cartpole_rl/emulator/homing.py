@@ -207,22 +207,25 @@ class HeldWatch:
         self._stands = max(1, STANDS // hardware.cart_nanometres_per_count)  # counts
         self._fast = hardware.pole_counts_per_turn * FAST // 10  # counts/s
         self._full_push = RoughMotor(hardware).value(hardware.gentle_force)
-        self._ran = 0.0  # m/s, at the reading before; 0 if the pole was fast
+        self._ran = 0.0  # m/s, when the cart last moved; 0 if the pole was fast
+        self._stopped = False  # at the reading before, at once
         self.window = Window(AGAINST_STOP)
 
     def is_held(self, before: Reading, reading: Reading, direction: int, motor: int, travels: bool) -> bool:
         """Return whether the cart stands under a full push, or stopped at once where it `travels`.
 
-        A fast pole can stop a cart.
+        It then stands at the next reading, too: a board may send a count twice. A fast pole can stop a cart.
         """
         ran, fast = direction * self._ran, pole_speed(before, reading) > self._fast
         moved = reading.cart - before.cart
         way = (ran - HARDEST_STOP / 2 * reading.seconds) * reading.seconds  # m
         runs_on = travels and not fast and ran >= RUNS and way > (2 * self._stands + 1) * self._metres
-        self._ran = 0.0 if fast else moved * self._metres / reading.seconds
+        again, self._stopped = self._stopped, runs_on and abs(moved) <= self._stands
+        if not self._stopped:
+            self._ran = 0.0 if fast else moved * self._metres / reading.seconds
         self.window.add(reading.cart, reading.us)
         pushed = motor == direction * self._full_push and self.window.spread <= self._stands
-        return (runs_on and abs(moved) <= self._stands) or pushed
+        return (self._stopped and again) or pushed
 
 
 class Homing:

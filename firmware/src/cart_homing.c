@@ -84,6 +84,7 @@ static bool first_reading(cart_homing *homing, const cart_reading *reading, uint
     homing->elapsed_us = 0;
     homing->before = *reading;
     homing->ran = 0;
+    homing->stopped = false;
     cart_servo_reset(&homing->servo);
     cart_window_reset(&homing->window, window_us);
     return true;
@@ -138,20 +139,23 @@ static outcome misses(cart_homing *homing, uint8_t side)
     return FAILS;
 }
 
-/* True if the cart stands under a full push in `direction` or, where it `travels`, stopped at once: a stop or something
-   else holds it, or its encoder is dead. A fast pole can stop a cart. */
+/* True if the cart stands under a full push in `direction` or, where it `travels`, stopped at once and stands at the
+   next reading, too: a stop or something else holds it, or its encoder is dead. A fast pole can stop a cart. */
 static bool is_held(cart_homing *homing, const cart_reading *reading, int direction, bool travels, double speed,
                     int16_t motor)
 {
     double ran = direction * homing->ran, time = seconds(reading);
     bool fast = pole_speed(homing, reading) > FAST_POLE;
-    bool runs_on = travels && !fast && ran >= RUNS && (ran - HARDEST_STOP / 2 * time) * time > (2 * STANDS_COUNTS + 1) * CART_METRES;
-    bool stopped = runs_on && cart_distance(reading->cart, homing->before.cart) <= STANDS_COUNTS;
-    homing->ran = fast ? 0 : speed;
+    double way = (ran - HARDEST_STOP / 2 * time) * time;
+    bool runs_on = travels && !fast && ran >= RUNS && way > (2 * STANDS_COUNTS + 1) * CART_METRES;
+    bool again = homing->stopped;
+    homing->stopped = runs_on && cart_distance(reading->cart, homing->before.cart) <= STANDS_COUNTS;
+    if (!homing->stopped)
+        homing->ran = fast ? 0 : speed;
     homing->before = *reading;
     cart_window_add(&homing->window, reading->cart, reading->period_us);
     bool pushed = motor == direction * CART_FULL_PUSH && cart_window_spread(&homing->window) <= STANDS_COUNTS;
-    return stopped || pushed;
+    return (homing->stopped && again) || pushed;
 }
 
 /* Move until a stop holds the cart or, with switches, until that of `side` is `pressed` or released. The right end is

@@ -51,7 +51,8 @@ typedef struct {
     cart_reading before; /* the reading before the present one */
     int32_t start;       /* cart count when the stage began, or when the pole was last fast */
     double rolled;       /* m/s the wrong way then */
-    double ran;          /* m/s, at the reading before; 0 if the pole was fast */
+    double ran;          /* m/s, when the cart last moved; 0 if the pole was fast */
+    bool stopped;        /* at the reading before, at once */
     cart_zeros zeros;    /* as far as they are found; before that, ends are where homing began */
     int32_t pressed_at;  /* cart count at the look that saw a switch newly pressed */
     int64_t widest;      /* counts of the pole's swing before the brake can have changed it much */
