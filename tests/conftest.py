@@ -7,6 +7,8 @@ handler, as tests interrupt their own process too. The handler of the others doe
 itself still outlives them, as nohup is meant to. SIGPIPE is left alone: Python ignores it, and subprocess
 restores it in children.
 
+Hypothesis sets no deadlines: no test fails because a machine is slow.
+
 Torch takes one thread, here and in children: the work of a test is small, and threads would wait busily.
 Python collects garbage seldom: with torch imported, it would take a sixth of the time of a small command.
 """
@@ -24,6 +26,7 @@ import torch
 import yaml
 from command_line import no_pictures
 from hydra_configs import shipped_choices
+from hypothesis import HealthCheck, settings
 
 from cartpole_rl.envs.build import make_env
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
@@ -45,6 +48,8 @@ CONF = Path(__file__).parents[1] / "conf"
 os.environ["OMP_NUM_THREADS"] = "1"  # of children
 torch.set_num_threads(1)
 gc.set_threshold(100_000, 50, 100)
+settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("any machine")
 
 
 def outlive(number: int, frame: FrameType | None) -> None:

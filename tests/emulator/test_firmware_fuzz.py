@@ -52,7 +52,7 @@ def envelope(stuffed: bytes) -> Envelope | None:
 
 @one_firmware
 @given(streams())
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_the_hosts_decoder_takes_any_bytes(stream):
     splitter = FrameSplitter()
     for stuffed in splitter.feed(stream):
@@ -67,7 +67,7 @@ def test_the_hosts_decoder_takes_any_bytes(stream):
 
 @given(streams())
 @example(b"".join(frame + b"\x00" for frame in FRAMES))
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_a_disarmed_cart_stays_still_and_disarmed_under_any_bytes(stream):
     firmware, splitter = make_firmware(lambda: 0, homed=True), FrameSplitter()
     for stuffed in splitter.feed(stream):
@@ -106,7 +106,7 @@ def any_number(letter: str) -> st.SearchStrategy[int]:
 
 
 @given(st.lists(any_host_message() | st.integers(-40_000, 40_000), max_size=40), st.booleans())
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_a_cart_that_is_neither_armed_nor_homing_is_at_most_braked(events, homed):
     """Valid frames in any order, between periods that end at any count (an int)."""
     firmware, now_us, braked = make_firmware(lambda: 3_000, homed), 0, False

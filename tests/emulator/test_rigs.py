@@ -99,13 +99,13 @@ def check_homes(cart: EmulatorSettings) -> None:
     assert abs(math.remainder(angle - math.pi, math.tau)) < 0.07
 
 
-@settings(max_examples=6, derandomize=True, deadline=None)
+@settings(max_examples=6, derandomize=True)
 @given(rig=rigs(), seed=st.integers(0, 99))
 def test_both_firmwares_home_the_cart_of_any_rig(rig: Hardware, seed: int) -> None:
     check_homes(cart_of(rig, seed=seed))
 
 
-@settings(max_examples=3, derandomize=True, deadline=None)
+@settings(max_examples=3, derandomize=True)
 @given(rig=rigs(spans=(0.2, 0.4)), seed=st.integers(0, 99))
 def test_a_short_track_has_room_for_a_swinging_pole(rig: Hardware, seed: int) -> None:
     check_homes(cart_of(rig, seed=seed, boot="anywhere"))
