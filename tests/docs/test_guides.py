@@ -91,8 +91,10 @@ def made(trained: Path) -> Callable[[str], None]:
     """Make runs/<kind>/first unless it is there, and what it is made from."""
 
     def make(kind: str) -> None:
-        if (trained / f"runs/{kind}/first").exists():
+        folder = trained / f"runs/{kind}/first"
+        if folder.exists() and (kind != "export" or any(folder.rglob("*.mcap"))):
             return
+        shutil.rmtree(folder, ignore_errors=True)  # an export of another page
         if kind == "import":
             make("identify")
             lay_out_logs(trained)
