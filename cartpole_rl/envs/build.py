@@ -60,10 +60,11 @@ def known_guard_numbers(settings: str) -> TrackGuard:
 
 def guard_numbers(config: CartPoleSettings, plant: PlantSettings | None = None) -> TrackGuard:
     """Return the numbers of the track guard, fitted to the carts of `config` or of a learned `plant`."""
-    draws = randomizer(config)
-    models = Models(config.cart_friction.model, config.pole_friction.model, config.actions.actuator)
     if isinstance(plant, LearnedSettings):
         draws, models = driven_carts(config, plant)
+    else:
+        draws = randomizer(config)
+        models = Models(config.cart_friction.model, config.pole_friction.model, config.actions.actuator)
     motors, period = config.actions.motors, config.control_period
     track_end = config.nominal_cart["track_half_length"]
     return fitted_guard(config.guard.quantile, draws, motors, models, period, track_end)

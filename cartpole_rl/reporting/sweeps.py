@@ -321,6 +321,7 @@ def _agents(kept: Sequence[Kept], measure: str, curves: Mapping[Path, Mapping[st
                 name: member.run.folder.as_posix()
                 for each, member in own.items()
                 for name in (each, member.run.kept)  # a fine-tuning has pictures of the policy that it kept
+                if name
             },
             seeds=first.seeds,
             source=first.source,

@@ -18,6 +18,7 @@ from cartpole_rl.files import claimed
 from cartpole_rl.learning.agent import QAgent
 from cartpole_rl.learning.checkpoints import forget_training, load_training, restore_weights, whole_state
 from cartpole_rl.learning.states import seed_everything
+from cartpole_rl.physics.models import Models
 from cartpole_rl.plants.effects import without_effect
 from cartpole_rl.randomization.identified import IdentifiedCarts
 from cartpole_rl.randomization.randomizer import Draws
@@ -77,7 +78,7 @@ def train(config: TrainConfig, folder: Path) -> float | None:
         config.check_learning()
     with claimed(folder):
         write_config(folder, "train", config.model_dump(mode="json"), resumed=checkpoint is not None)
-        print_notes(config, env.plant.randomizer)
+        print_notes(config, env.plant.randomizer, env.plant.models)
         if checkpoint:
             warn_of_changes(checkpoint.drawn_from)
         step = checkpoint.step if checkpoint else None
@@ -148,7 +149,7 @@ def available_device(device: str) -> str:
     return device
 
 
-def print_notes(config: TrainConfig, draws: Draws) -> None:
+def print_notes(config: TrainConfig, draws: Draws, models: Models) -> None:
     """Print how the cart differs from the nominal one and from those in training, and its track guard."""
     if "cart" not in config.plant.ignored:
         note_other_numbers("train", config.nominal_cart, (config.pole.choices or {}).values())
@@ -160,7 +161,7 @@ def print_notes(config: TrainConfig, draws: Draws) -> None:
             f"note: {', '.join(given)}: plant={config.plant.kind} has its own cart and friction; only carts "
             "that are drawn from randomization= have these numbers",
         )
-    note_unused_randomization(config, draws)
+    note_unused_randomization(config, draws, models)
     if config.guard.active:
         print_message("train", f"track guard: {config.guard.active}")
 
@@ -188,13 +189,12 @@ def warn_of_changes(drawn_from: Mapping[str, str]) -> None:
             )
 
 
-def note_unused_randomization(config: TrainConfig, draws: Draws) -> None:
-    """Print the ranges that change nothing with the chosen actions and friction models."""
+def note_unused_randomization(config: TrainConfig, draws: Draws, models: Models) -> None:
+    """Print the ranges that change nothing with the chosen actions, on carts that `models` move."""
     if getattr(config.plant, "prior_share", 1) == 0:
         if config.randomization:
             print_message("train", "note: plant.prior_share=0: no cart is drawn from randomization=")
         return
-    models = driven_carts(config, config.plant)[1]
     encoders = config.hardware.encoders
     if unused := without_effect(
         draws, config.ranges, config.actions.motors, models, config.control_period, encoders

@@ -12,8 +12,6 @@
 #define LOOK_US (62000000 / CART_POLE_COUNTS > CART_SHORTEST_US ? 62000000 / CART_POLE_COUNTS : CART_SHORTEST_US)
 #define ROUNDING_UM_S (4000LL * CART_NANOMETRES / LOOK_US) /* um/s: four counts of the cart in a look */
 #define SPEED_CHANGE (ROUNDING_UM_S > 200000 ? ROUNDING_UM_S : 200000)
-#define FASTEST_CART (5000000000LL / CART_NANOMETRES) /* counts/s: 5 m/s */
-#define FASTEST_POLE (16LL * CART_POLE_COUNTS)        /* counts/s: 16 turns a second */
 #define SECOND_US 1000000LL
 
 static int8_t push(int16_t motor)
@@ -42,20 +40,9 @@ bool cart_stalled(cart_stall_watch *watch, int32_t cart, int16_t motor, uint32_t
     return watch->pushed_us >= STALL_US;
 }
 
-/* One count may come from rounding. */
-static bool too_fast(int64_t moved, int64_t us, int64_t fastest)
+bool cart_too_fast(int64_t moved, int64_t us, int64_t fastest)
 {
     return (moved - 1) * SECOND_US > fastest * us;
-}
-
-bool cart_cart_too_fast(int64_t moved, int64_t us)
-{
-    return too_fast(moved, us, FASTEST_CART);
-}
-
-bool cart_pole_too_fast(int64_t moved, int64_t us)
-{
-    return too_fast(moved, us, FASTEST_POLE);
 }
 
 static bool jumped(cart_jump_watch *watch, int32_t count, uint32_t period_us, int64_t fastest)
@@ -64,17 +51,17 @@ static bool jumped(cart_jump_watch *watch, int32_t count, uint32_t period_us, in
     int64_t moved = cart_distance(count, watch->last);
     watch->counted = true;
     watch->last = count;
-    return !first && too_fast(moved, (int64_t)period_us, fastest);
+    return !first && cart_too_fast(moved, (int64_t)period_us, fastest);
 }
 
 bool cart_cart_jumped(cart_jump_watch *watch, int32_t cart, uint32_t period_us)
 {
-    return jumped(watch, cart, period_us, FASTEST_CART);
+    return jumped(watch, cart, period_us, CART_FASTEST_CART);
 }
 
 bool cart_pole_jumped(cart_jump_watch *watch, int32_t pole, uint32_t period_us)
 {
-    return jumped(watch, pole, period_us, FASTEST_POLE);
+    return jumped(watch, pole, period_us, CART_FASTEST_POLE);
 }
 
 bool cart_cart_frozen(cart_frozen_cart_watch *watch, int32_t cart, int16_t motor, uint32_t period_us)

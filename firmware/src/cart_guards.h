@@ -9,6 +9,9 @@
 #include <stdbool.h>
 #include <stdint.h>
 
+#define CART_FASTEST_CART (5000000000LL / CART_NANOMETRES) /* counts/s: 5 m/s */
+#define CART_FASTEST_POLE (16LL * CART_POLE_COUNTS)        /* counts/s: 16 turns a second */
+
 typedef struct {
     int8_t direction;   /* of the push that is watched: 1, -1, or 0 for none */
     int32_t anchor;     /* cart count at its start */
@@ -50,11 +53,10 @@ void cart_guards_reset(cart_guards *guards);
 /* A push of at least CART_HARD_PUSH one way for 0.5 s that moves the cart by less than 1 mm. */
 bool cart_stalled(cart_stall_watch *watch, int32_t cart, int16_t motor, uint32_t period_us);
 
-/* Have so many counts in `us` changed faster than cart or pole can move? */
-bool cart_cart_too_fast(int64_t moved, int64_t us);
-bool cart_pole_too_fast(int64_t moved, int64_t us);
+/* Has a count `moved` in `us` faster than `fastest` counts/s? One count may come from rounding. */
+bool cart_too_fast(int64_t moved, int64_t us, int64_t fastest);
 
-/* A count that changes so fast over a period. */
+/* A count that changes faster over a period than cart or pole can move. */
 bool cart_cart_jumped(cart_jump_watch *watch, int32_t cart, uint32_t period_us);
 bool cart_pole_jumped(cart_jump_watch *watch, int32_t pole, uint32_t period_us);
 

@@ -21,8 +21,8 @@
     (!CART_SWITCHES || ((homing)->stage == CART_TOUCH_RIGHT && CART_SWITCHES != CART_RIGHT))
 #define AGAINST_STOP_US 400000u /* under full push without motion that mean a stop */
 #define STANDS_COUNTS AT_LEAST_ONE(300000 / CART_NANOMETRES) /* largest motion in that time: 0.3 mm */
-#define RUNS 0.1           /* m/s, from which a cart takes time to stop, unless something stops it at once */
-#define HARDEST_STOP 5.0   /* m/s^2, of friction, the pole and the motor */
+#define RUNS 0.1 /* m/s, from which a cart takes time to stop, unless something stops it at once */
+#define HARDEST_STOP 5.0 /* m/s^2, of friction, the pole and the motor */
 #define LONGEST_SEARCH_US (CART_SPAN_UM > 1500000 ? CART_SPAN_UM * 20u : 30000000u) /* for one stop */
 #define LONGEST_LEAVING_US 5000000u /* to move off a switch, for which a second is usual */
 #define CENTRED_NM 1000000

@@ -83,12 +83,12 @@ static int64_t moved(const cart_limits *limits, const int32_t *counts)
 
 bool cart_limits_cart_jumped(const cart_limits *limits)
 {
-    return cart_cart_too_fast(moved(limits, limits->carts), window_us(limits));
+    return cart_too_fast(moved(limits, limits->carts), window_us(limits), CART_FASTEST_CART);
 }
 
 bool cart_limits_pole_jumped(const cart_limits *limits)
 {
-    return cart_pole_too_fast(moved(limits, limits->poles), window_us(limits));
+    return cart_too_fast(moved(limits, limits->poles), window_us(limits), CART_FASTEST_POLE);
 }
 
 void cart_limits_forget(cart_limits *limits)

@@ -143,7 +143,7 @@ def test_the_notes_and_the_preview_are_about_its_carts(
         given = {"plant": "learned", "plant.model": str(learned[0]), **settings}
         monkeypatch.setattr("sys.argv", ["", *(f"{name}={value}" for name, value in given.items())])
         config = load_settings(TrainConfig, given)
-        print_notes(config, driven_carts(config, config.plant)[0])
+        print_notes(config, *driven_carts(config, config.plant))
         return capsys.readouterr().err
 
     other = {"step": "sigmoid", "sigmoid": "step"}[report(learned[0])["cart_friction"]]

@@ -20,7 +20,7 @@ SLOPE = {"+randomization.sigmoid_slope": {"factor": [0.5, 2]}}
 def notes(capsys: pytest.CaptureFixture[str]) -> Any:
     def told(**settings: Any) -> str:
         config = load_settings(TrainConfig, settings)
-        print_notes(config, randomizer(config))
+        print_notes(config, randomizer(config), config.models(config.plant))
         return "".join(line for line in capsys.readouterr().err.splitlines() if "note:" in line)
 
     return told

@@ -44,7 +44,7 @@ def new_training(overrides: dict[str, Any], device: torch.device | str) -> Train
     config = with_fitted_guard(load_settings(TrainConfig, SHORT | overrides))
     seed_everything(1)
     env = simulated_env(config, config.plant, config.learning.carts, config.task.start, seed=1, device=device)
-    note_unused_randomization(config, env.plant.randomizer)
+    note_unused_randomization(config, env.plant.randomizer, env.plant.models)
     settings = config.learning.at(config.control_period), config.buffer, config.optimizer
     return Training(*settings, new_agent(config, device), env, lambda: [], Monitor(), seed=1)
 

@@ -28,7 +28,6 @@ MOTORS = (-255, -100, 0, 255)
 PERIODS = 12
 RELAXED = settings(
     max_examples=10,
-    deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
 QUICK = {
