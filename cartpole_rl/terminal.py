@@ -196,8 +196,9 @@ def _write(text: str) -> None:
 
 
 def words_given(*settings: str) -> list[str]:
-    """Return the words of the command line that choose these settings, in quotes where a shell needs them."""
-    return [shlex.quote(word) for word in sys.argv[1:] if word.partition("=")[0] in settings]
+    """Return the words of the command line that give these settings or parts of them, quoted for a shell."""
+    names = ((re.split(r"[.=]", word.lstrip("+"))[0], word) for word in sys.argv[1:])
+    return [shlex.quote(word) for name, word in names if name in settings]
 
 
 def print_results(folder: Path, files: str, following: str | None) -> None:

@@ -13,7 +13,7 @@ from cartpole_rl.errors import RecordingError
 from cartpole_rl.identification.prediction import REPORTED, Replayed, away_from_upright, replay
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.sensors import Motion, question_sensors, samples_of
-from cartpole_rl.identification.windows import mean_gap, naming, recorded_period
+from cartpole_rl.identification.windows import mean_gap, naming
 from cartpole_rl.rig.hardware import Hardware
 from cartpole_rl.tasks.episode import Episode, wrap
 
@@ -99,7 +99,7 @@ def shared_period(recordings: Mapping[str, Episode]) -> float:
                 f"{file} has a frame every {1e3 * other:g} ms, {first} every {1e3 * period:g} ms: give "
                 "recordings of one control period"
             )
-    return recorded_period(recordings[first])
+    return period
 
 
 def check_period(episode: Episode, period: float) -> None:
@@ -107,7 +107,7 @@ def check_period(episode: Episode, period: float) -> None:
     if not episode.steps:
         return
     found = mean_gap(episode.time)
-    if all(abs(each / period - 1) > SAME_PERIOD for each in (found, recorded_period(episode))):
+    if abs(found / period - 1) > SAME_PERIOD:
         raise RecordingError(
             f"a frame every {1e3 * found:g} ms, not every {1e3 * period:g} ms: give "
             f"control_period={found:g}, and recordings of one period"

@@ -107,6 +107,11 @@ class Replayed(NamedTuple):
     x_error: Array  # [S, T + 1] m, simulated minus measured
     theta_error: Array  # [S, T + 1] rad, wrapped
 
+    def rows(self) -> NDArray[np.intp]:
+        """Return the row of the episode for each time, [S, T + 1]; its stamps may jitter."""
+        period = self.time[0, 1] - self.time[0, 0]
+        return np.searchsorted(self.episode.time, self.time - period / 2)
+
 
 def replay(recordings: Mapping[str, Episode], dynamics: Dynamics, restart: float) -> list[Replayed]:
     """Return each recording beside the cart of `dynamics`, which is put back onto it every `restart` s.

@@ -182,11 +182,6 @@ def mean_gap(time: NDArray[np.float64]) -> float:
     return float(f"{near.mean() if near.size else median:.4g}")
 
 
-def recorded_period(episode: Episode) -> float:
-    """Return the control period of a recording, s: the median time between frames, to 0.01 ms."""
-    return round(float(np.median(np.diff(episode.time))), 5)
-
-
 def split(episodes: Sequence[Episode]) -> tuple[list[Episode], list[Episode]]:
     """Return episodes to learn from and held-out ones: every fifth, or the last fifth of each of a few."""
     if len(episodes) >= HELD_OUT:

@@ -281,7 +281,7 @@ def unexplained(replays: Sequence[Replayed], latency: float) -> Unexplained:
         apart = max(1, round(SPACED / period))
         before, now, after = (slice(None, -2 * apart), slice(apart, -apart), slice(2 * apart, None))
         error, measured = -replayed.x_error, replayed.x - replayed.x_error
-        rows = np.searchsorted(replayed.episode.time, replayed.time[:, now] - period / 2)
+        rows = replayed.rows()[:, now]
         motor = delayed(replayed.episode.motor.astype(float), latency / period)
         values = (
             (error[:, before] - 2 * error[:, now] + error[:, after]) / (apart * period) ** 2,

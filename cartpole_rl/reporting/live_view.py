@@ -63,6 +63,14 @@ def has_cursor() -> bool:
     return sys.stderr is not None and sys.stderr.isatty() and os.environ.get("TERM", "") not in ("", "dumb")
 
 
+def terminal_size() -> os.terminal_size:
+    """Return the size of the terminal behind stderr, on which the view is drawn; stdout may be a file."""
+    with suppress(OSError, ValueError):  # closed, or no terminal
+        if (size := os.get_terminal_size(sys.stderr.fileno())).columns:
+            return size
+    return shutil.get_terminal_size()
+
+
 def show(memory: Memory, title: str, parent: int) -> None:
     """Draw the newest snapshot at the lowest priority, until the process is ended or its parent ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
@@ -78,7 +86,7 @@ def draw(memory: Memory, title: str, colour: bool) -> NoReturn:
         number, snapshot = read(memory) or (0, None)
         if number != newest:
             newest, changed = number, time.monotonic()
-        columns, rows = terminal = shutil.get_terminal_size()
+        columns, rows = terminal = terminal_size()
         if size != terminal:
             size = columns, rows
             put(reserved(rows))

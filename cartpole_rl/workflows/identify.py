@@ -374,7 +374,7 @@ def write_friction(law: Law, parameters: Mapping[str, float], folder: Path) -> N
 def friction_choice(law: Law, folder: Path) -> str:
     """Return the choice of a friction law on a command line, after `write_friction` into `folder`."""
     kind = law.registry.kind
-    return f"{kind}={law if is_shipped(kind, law) else f'{folder}/{kind}.yaml'}"
+    return as_word(kind, law if is_shipped(kind, law) else folder / f"{kind}.yaml")
 
 
 def standard_deviations(carts: np.ndarray) -> dict[str, float]:

@@ -36,7 +36,7 @@ from cartpole_rl.identification.sensors import Estimate, Sensors, question_senso
 from cartpole_rl.identification.settings import ImportConfig, Layout, log_files
 from cartpole_rl.rig.hardware import nominal_hardware
 from cartpole_rl.run_folder import RECORDINGS, write_config, write_json
-from cartpole_rl.terminal import as_word, print_message, print_results, progress_bar, shown
+from cartpole_rl.terminal import as_word, print_message, print_results, progress_bar, shown, words_given
 from cartpole_rl.workflows.build import RECORDED
 from cartpole_rl.workflows.checks import exported_recordings
 
@@ -396,9 +396,11 @@ def print_summary(
         print("the recordings are too short, or show too little motion, to question their sensors")
     for doubt in found:
         print(f"doubt: {doubt}")
-    cart = "" if config.hardware == nominal_hardware() else " cart=<yours>.yaml"
-    rate = "" if math.isclose(period, choice("identify")["control_period"]) else f" control_period={period:g}"
-    following = f"cartpole-identify {as_word('from', shown(folder))}{cart} pole=<yours>.yaml{rate}"
+    unknown = [] if config.hardware == nominal_hardware() else ["cart=<yours>.yaml"]
+    words = [as_word("from", shown(folder)), *(words_given("cart") or unknown), "pole=<yours>.yaml"]
+    if not math.isclose(period, choice("identify")["control_period"]):
+        words.append(f"control_period={period:g}")
+    following = " ".join(["cartpole-identify", *words])
     if not SHORTEST_PERIOD <= period <= LONGEST_PERIOD:
         following = "cartpole-import, with the layout mended"
     print_results(folder, f"{RECORDINGS}/ and {IMPORTED}", following)

@@ -89,7 +89,7 @@ def replay_recordings(config: ReplayConfig, folder: Path) -> None:
     following = ["cartpole-model", as_word("from", shown(config.source)), *of_cart]
     print_results(folder, f"{REPLAY} and {FIGURE}", " ".join(following))
     if config.view == "web":
-        track = settings.task.x_max
+        track = parameters["track_half_length"]
         shown_episodes = [shown_beside(*pair, track) for pair in zip(paths, replays, strict=True)]
         with WebView(f"Replay of {paths[0].parent.parent.name}", pole.length, shown_episodes) as view:
             view.wait()
@@ -99,7 +99,7 @@ def shown_beside(path: Path, replayed: Replayed, track: float) -> dict[str, Any]
     """Return what the page of `view=web` shows of a recording; the ghost is the simulated cart."""
     episode, rows = replayed.episode, len(replayed.episode.time)
     ghost = np.full((2, rows), np.nan)
-    places = np.searchsorted(episode.time, replayed.time - 1e-6)
+    places = replayed.rows()
     for channel, values in zip(ghost, (replayed.x, replayed.theta), strict=True):
         known = np.isfinite(values) & (places < rows)
         channel[places[known]] = values[known]

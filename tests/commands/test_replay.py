@@ -46,7 +46,9 @@ def test_the_same_cart_is_followed(recorded: Path, tmp_path: Path) -> None:
 
 
 def test_another_cart_is_not_followed(recorded: Path, tmp_path: Path) -> None:
-    _, results = replay(recorded / "recordings/episode_000.csv", tmp_path, "parameters={cart_coulomb:0.8}")
+    other = "parameters={cart_coulomb:0.8}", "cart=ip02", "cart.cart_mass=0.71"
+    done, results = replay(recorded / "recordings/episode_000.csv", tmp_path, *other)
+    assert done.out.splitlines()[-1].endswith("episode_000.csv cart=ip02 cart.cart_mass=0.71")
     assert len(results["recordings"]) == 1
     assert results["parameters"]["cart_coulomb"] == 0.8
     assert results["errors"][0]["rms_x_mm"] > 0.3

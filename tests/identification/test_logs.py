@@ -18,7 +18,7 @@ from cartpole_rl.choices import choice, conf_folder
 from cartpole_rl.composition import compose
 from cartpole_rl.errors import ConfigError, RecordingError
 from cartpole_rl.evaluation.recordings import read_recording, write_recording
-from cartpole_rl.identification.checks import check_directions, check_recordings
+from cartpole_rl.identification.checks import check_directions, check_recordings, shared_period
 from cartpole_rl.identification.experiments import recording
 from cartpole_rl.identification.logs import Log, cut_log, read_rows
 from cartpole_rl.identification.sensors import Motion, question_sensors
@@ -410,7 +410,7 @@ def test_the_period_is_the_mean_gap(tmp_path: Path, motion: Columns) -> None:
     """60 Hz with stamps in whole milliseconds: the median gap is 17 ms."""
     columns = {**motion, "t": np.round(np.arange(STEPS) / 60, 3)}
     log = read_log(written(tmp_path / "log.csv", columns), layout(), nominal_encoders())
-    assert log.report.period == 0.01667
+    assert log.report.period == shared_period({"log.csv": log.parts[0]}) == 0.01667
     assert len(log.parts) == 1
 
 
@@ -686,9 +686,10 @@ def test_the_command_imports_what_identify_and_replay_take(tmp_path: Path, motio
     written(tmp_path / "log.csv", motion)
     (tmp_path / "mine.yaml").write_text("defaults: [plain]\ntime: {name: t}\nposition: {name: x}\n")
     given = ("from=log.csv", "layout=mine.yaml", "layout.angle.name=a", "layout.motor={name: u, full: 255}")
+    given += ("cart=ip02",)
     done = in_process("import", *given, "hydra.run.dir=run", folder=tmp_path)
     assert (done.code, done.err) == (0, "")
-    assert done.out.splitlines()[-1] == "cartpole-identify from=run pole=<yours>.yaml"
+    assert done.out.splitlines()[-1] == "cartpole-identify from=run cart=ip02 pole=<yours>.yaml"
     done = in_process("replay", "from=run", "pole=medium", "hydra.run.dir=replayed", folder=tmp_path)
     assert (done.code, done.err) == (0, "")
     again = in_process("import", *given, "hydra.run.dir=run", folder=tmp_path)

@@ -127,6 +127,9 @@ def test_what_is_not_explained_is_the_difference_of_accelerations(swing_up: Epis
     measured = swing_up.x[:rows]
     nothing = np.zeros((1, rows))
     replayed = Replayed(swing_up, time[None], (measured + error)[None], nothing, error[None], nothing)
+    jitter = np.random.default_rng(0).uniform(-0.4, 0.4, len(swing_up.time)) * period
+    late = dataclasses.replace(swing_up, time=swing_up.time + jitter)
+    np.testing.assert_array_equal(replayed._replace(episode=late).rows(), [np.arange(rows)])
     found = unexplained([replayed], latency=0.0)
     assert found.acceleration == pytest.approx(np.full(rows - 2, 1.5))
     assert found.position == pytest.approx(measured[1:-1])

@@ -3,6 +3,7 @@
 import os
 import pty
 import sys
+import termios
 import threading
 import time
 from typing import Self
@@ -47,6 +48,7 @@ class Terminal:
     def __init__(self) -> None:
         self.text = ""
         self._reader, writer = pty.openpty()
+        termios.tcsetwinsize(writer, (40, 61))
         self._stderr = os.fdopen(writer, "w")
 
     def __enter__(self) -> Self:
@@ -83,6 +85,7 @@ def test_it_is_drawn_while_the_cart_is_driven_and_gives_the_terminal_back(
             write(live.memory, 1, CALM)
             terminal.wait_for("emulated cart: episode 2, step 120")
             assert ALL_LINES not in terminal.text
+            assert "\x1b[8;40r" in terminal.text  # of this terminal; stdout is another file
         terminal.wait_for(ALL_LINES)
     assert GREEN not in terminal.text
 
