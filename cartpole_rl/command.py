@@ -71,7 +71,7 @@ def run_command(name: str, verb: "Verb") -> None:
         provide_config(name, schema)
         with hydra_overrides(name, as_multirun(given)) as (words, as_typed), sweep(name, schema):
             work = partial(run_job, name, verb, given, as_typed)
-            for sys.argv[1:] in shown_jobs(words) or [words]:
+            for sys.argv[1:] in shown_jobs(name, words) or [words]:
                 hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=name)(work)()
     except EXPECTED as error:
         exit_with_message(name, error, kinds(schema, "plant"))

@@ -44,6 +44,7 @@ from cartpole_rl.choices import (
     WHOLE,
     Choice,
     Chosen,
+    choice,
     conf_folder,
     default_choices,
     group_choices,
@@ -186,6 +187,7 @@ class _OwnChoices:
         self.given: dict[str, dict[str, dict[str, Any]]] = defaultdict(dict)  # group: name: what it gives
         self.names: dict[str, set[str]] = defaultdict(set)  # other choices, by group
         self.swept: set[str] = set()  # groups of which several choices are given
+        self.params: list[str] = []  # of the chosen sweep, as words of the command line
         self.stored: list[tuple[str, str]] = []  # group and name of each, in the ConfigStore
 
     def by_name(self, name: str, value: Any) -> str:
@@ -215,7 +217,8 @@ class _OwnChoices:
 
     def completed(self, words: list[str]) -> list[str]:
         """Return the words, and those by which what the user gave outlasts other choices."""
-        keys = {key_of(word) for word in words}
+        all_words = [*self.params, *words]
+        keys = {key_of(word) for word in all_words}
         frictions = [group for group in FRICTIONS if self.groups.get(group) is not None or group in keys]
         groups = sorted(self.given.keys() - {"sweep"}, key=lambda group: (group in WHOLE, group in FRICTIONS))
         more = self._resumed(words)
@@ -241,7 +244,7 @@ class _OwnChoices:
             names = [f"{group}.parameters.{name}" for name in values["parameters"]]
             if f"{group}.parameters" not in keys:
                 more += [f"++{name}=null" for name in names if name not in keys]
-        valued = {key_of(word) for word in words if not re.search("^~|=null$", word, re.IGNORECASE)}
+        valued = {key_of(word) for word in all_words if not re.search("^~|=null$", word, re.IGNORECASE)}
         more += [
             f"++{periods}=null"
             for seconds, periods in IN_PERIODS.items()
@@ -285,6 +288,8 @@ class _OwnChoices:
         if not isinstance(chosen, str):
             return self._store(group, chosen)
         self.names[group].add(chosen)
+        if group == "sweep" and is_shipped(group, chosen):
+            self._with_params(choice(f"{group}/{chosen}"))
         if NAME.fullmatch(chosen) or "${" in chosen:
             return chosen
         return "'" + chosen.replace("\\", "\\\\").replace("'", "\\'") + "'"
@@ -318,11 +323,25 @@ class _OwnChoices:
             for other, each in loaded.groups.items()
         ]
         values = loaded.values if group in WHOLE else _with_defaults(group, loaded.values)
+        if group == "sweep":
+            values = self._with_params(values)
         name = self._free_name(group, chosen)
         node = {"defaults": [*groups, "_self_"], **values} if groups else values
         self._put(group, name, node, "_global_" if group in WHOLE else None)
         self.given[group][name] = loaded.given
         return name
+
+    def _with_params(self, sweep: dict[str, Any]) -> dict[str, Any]:
+        """Note the parameters of a sweep; return it with names of choices in place of files among them."""
+        params: Any = sweep
+        for name in ("hydra", "sweeper", "params"):
+            params = params.get(name) if isinstance(params, Mapping) else None
+        if not isinstance(params, Mapping):
+            return sweep
+        words = {name: self.with_names(f"{name}={value}") for name, value in params.items()}
+        self.params += words.values()
+        texts = {name: words[name].partition("=")[2] for name in params if isinstance(params[name], str)}
+        return merged(sweep, {"hydra": {"sweeper": {"params": texts}}})
 
     def _put(self, group: str, name: str, node: Any, package: str | None) -> None:
         ConfigStore.instance().store(name, node, group, package)

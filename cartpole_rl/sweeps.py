@@ -13,7 +13,7 @@ import traceback
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import datetime
-from itertools import chain, count
+from itertools import count
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -26,7 +26,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict, read_write
 
 from cartpole_rl.checking import kinds, validated
-from cartpole_rl.composition import as_mapping, is_completing, task_overrides
+from cartpole_rl.composition import as_mapping, is_completing, reading_conf, task_overrides
 from cartpole_rl.errors import CartPoleError, ConfigError
 from cartpole_rl.exits import OF_HYDRA, exit_with_message, is_defect, one_line
 from cartpole_rl.files import write_text
@@ -120,15 +120,9 @@ class SweepStart(Callback):
 
 def check_jobs(config: DictConfig, schema: type[Settings]) -> None:
     """Raise for the first job of a sweep with a wrong setting, unless its sweeper chooses while it runs."""
-    sweeper = config.hydra.sweeper
-    if not sweeper._target_.endswith(BasicSweeper.__name__):
-        return
     loader = GlobalHydra.instance().config_loader()
-    words = [f"{key}={value}" for key, value in (sweeper.params or {}).items()]
-    words += task_overrides(config.hydra.overrides.task)
-    overrides = OverridesParser.create(loader).parse_overrides(words)
-    for job in chain.from_iterable(BasicSweeper.split_arguments(overrides, None)):
-        composed = loader.load_sweep_config(config, list(job))
+    for job in jobs_of(config):
+        composed = loader.load_sweep_config(config, job)
         with read_write(composed), open_dict(composed):
             del composed["hydra"]
         if composed.get("resume") is not None:
@@ -136,6 +130,18 @@ def check_jobs(config: DictConfig, schema: type[Settings]) -> None:
                 f"resume= continues one run; call {program(SweepStart.command)} once for each, without -m"
             )
         validated(schema, as_mapping(composed))
+
+
+def jobs_of(config: DictConfig) -> list[list[str]]:
+    """Return the overrides of each job of a sweep; none if its sweeper chooses them while it runs."""
+    sweeper = config.hydra.sweeper
+    if not sweeper._target_.endswith(BasicSweeper.__name__):
+        return []
+    words = [f"{key}={value}" for key, value in (sweeper.params or {}).items()]
+    words += task_overrides(config.hydra.overrides.task)
+    overrides = OverridesParser.create(GlobalHydra.instance().config_loader()).parse_overrides(words)
+    (jobs,) = BasicSweeper.split_arguments(overrides, None)
+    return jobs
 
 
 def as_multirun(words: Sequence[str]) -> list[str]:
@@ -148,14 +154,18 @@ def as_multirun(words: Sequence[str]) -> list[str]:
     return [*words, "--multirun"] if chosen and not has_mode else [*words]
 
 
-def shown_jobs(words: Sequence[str]) -> list[list[str]]:
+def shown_jobs(command: str, words: Sequence[str]) -> list[list[str]]:
     """Return the command lines that show the settings of each job: those of `-m --cfg job`; else none."""
     if {"-m", "--multirun"}.isdisjoint(words) or {"-c", "--cfg"}.isdisjoint(words):
         return []
-    options = [word for word in words if "=" not in word or word.startswith("-")]
-    overrides = OverridesParser.create().parse_overrides([word for word in words if word not in options])
-    (jobs,) = BasicSweeper.split_arguments(overrides, None)
-    return [[*job, *(word for word in options if word not in ("-m", "--multirun"))] for job in jobs]
+    overrides = [word for word in words if "=" in word and not word.startswith("-")]
+    with reading_conf():
+        loader = GlobalHydra.instance().config_loader()
+        config = loader.load_configuration(command, overrides, RunMode.MULTIRUN)
+        task = task_overrides(config.hydra.overrides.task)
+        jobs = jobs_of(config) or [task]
+    others = [word for word in words if word not in (*task, "-m", "--multirun")]
+    return [[*job, *others] for job in jobs]
 
 
 def is_job() -> bool:

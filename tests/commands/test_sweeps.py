@@ -8,6 +8,7 @@ from command_line import in_process
 
 from cartpole_rl.composition import EXTRAS
 from cartpole_rl.sweeps import as_multirun
+from cartpole_rl.workflows.config import TrainConfig
 
 FAILS = "cart.cart_mass=-1"  # at once, by a check of the job: the type is right
 
@@ -22,6 +23,30 @@ def test_a_sweep_needs_no_dash_m_and_takes_values_of_the_command_line(tmp_path: 
         f"cartpole-train: {number}_randomization-{width}: cart_mass is -1; it must be above 0 and at most 100"
         for number, width in enumerate(("none", "friction_6", "half", "wide"))
     ]
+
+
+SWEPT = """
+hydra:
+  sweeper:
+    params: {agent.horizon: 0.5, agent.action_gap: 0.3, cart.cart_viscous: 3, pole: "large,p.yaml"}
+"""
+
+
+def test_a_sweep_is_as_its_words_after_dash_m(tmp_path: Path) -> None:
+    """Also where other choices give what it replaces, and where all of its jobs are shown."""
+    (tmp_path / "own.yaml").write_text(SWEPT)
+    (tmp_path / "p.yaml").write_text("defaults: [large]")
+    words = ("sweep=own.yaml", "agent=thesis", "cart_friction=linear", "agent.action_time=0.1", "-m")
+    found = []
+
+    def note(config: TrainConfig) -> None:
+        agent = config.agent.at(0.02)
+        found.append((agent.gamma, agent.gap, config.nominal_cart["cart_viscous"]))
+
+    done = in_process("train", *words, folder=tmp_path, function=note)
+    assert (done.code, found) == (0, 2 * [(0.96, 0.3, 3.0)]), done.err
+    shown = in_process("train", *words, "--cfg", "job", folder=tmp_path)
+    assert (shown.code, shown.out.count("horizon: 0.5")) == (0, 2), shown.err
 
 
 @pytest.mark.parametrize(
