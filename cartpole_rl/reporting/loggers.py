@@ -5,6 +5,7 @@ A logger of one's own is a class that is made as `Logger` is, chosen as `logger=
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack, closing, suppress
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -67,11 +68,13 @@ class Loggers:
 
     def __init__(self, kinds: Sequence[Extension], folder: Path, purge_step: int | None = None) -> None:
         self._each: list[Logger] = []
-        for kind in kinds:
+        for kind in dict.fromkeys(kinds):
             try:
                 self._each.append(kind(folder, purge_step))
-            except ConfigError as error:
-                if purge_step is None:
+            except BaseException as error:
+                if purge_step is None or not isinstance(error, ConfigError):
+                    with suppress(Exception), closing(self):
+                        self.fail(error)
                     raise
                 print_message("train", f"warning: {error}; the run goes on without it")
 
@@ -80,6 +83,12 @@ class Loggers:
         for logger in self._each:
             if tell := getattr(logger, "fail", None):
                 tell(error)
+
+    def close(self) -> None:
+        """Close each of them, also where one before it raises."""
+        with ExitStack() as stack:
+            for logger in reversed(self._each):  # a stack
+                stack.callback(logger.close)
 
     def __getattr__(self, name: str) -> Any:
         if name not in vars(Logger):

@@ -9,6 +9,7 @@ goes on in the same run of either; points after its checkpoint then stand twice.
 import io
 import logging
 import os
+import re
 import tempfile
 import time
 from collections.abc import Callable, Mapping
@@ -22,7 +23,7 @@ from numpy.typing import ArrayLike
 from PIL import Image
 
 from cartpole_rl.errors import ConfigError, reason_of
-from cartpole_rl.files import locked
+from cartpole_rl.files import locked, write_text
 from cartpole_rl.reporting.loggers import Logger, flatten, library, sweep_of
 from cartpole_rl.reporting.style import png
 from cartpole_rl.terminal import print_message
@@ -33,6 +34,7 @@ SQLITE, STORE, PICTURES, EXPERIMENT = "sqlite:///", "runs/mlflow.db", "runs/mlfl
 WANDB_RUN, MLFLOW_RUN = "wandb_run.txt", "mlflow_run.txt"
 PATIENCE = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1", "MLFLOW_HTTP_REQUEST_TIMEOUT": "10"}  # else minutes
 MOST = 100  # parameters that MLflow takes at once
+SLOW, PAUSE = 1, 300  # s; after a call that failed so slowly, nothing is sent for so long
 
 
 class WandbLog(Logger):
@@ -49,13 +51,13 @@ class WandbLog(Logger):
                 name=folder.name,
                 group=sweep_of(folder),
                 dir=folder,
-                id=file.read_text() if purge_step is not None and file.exists() else None,
+                id=(file.read_text() or None) if purge_step is not None and file.exists() else None,
                 resume="allow",
                 settings=self._wandb.Settings(silent=True, console="off"),
             )
         except self._wandb.errors.Error as error:
             raise ConfigError(f"logger=wandb: {reason_of(error)} Or set WANDB_MODE=offline") from None
-        file.write_text(self._run.id)
+        write_text(file, self._run.id)
         self._exit_code = 0
         self._run.define_metric("*", step_metric=AXIS)
 
@@ -120,11 +122,12 @@ class MlflowLog(Logger):
         except Exception as error:  # of MLflow, SQLAlchemy or Alembic
             raise ConfigError(f"logger=mlflow, {store}: {reason_of(error)}") from None
         self._run, self._lost, self._status = run, False, "FINISHED"
+        self._pause_ends = 0.0  # s, of the monotonic clock
         if database:
             store = f"{SQLITE}{database.absolute().as_posix()}"
         elif "@" in store:  # after a password
             store = ""
-        file.write_text(f"{run}\n{store}\n")
+        write_text(file, f"{run}\n{store}\n")
 
     def _experiment(self) -> str:
         """Return the id of the experiment, which is made if it is missing."""
@@ -160,8 +163,9 @@ class MlflowLog(Logger):
 
     def hparams(self, config: Mapping[str, Any], metrics: Mapping[str, float | None]) -> None:
         """Log the settings, with dotted names, and the final metrics as `summary/...`."""
-        param = self._mlflow.entities.Param
-        settings = [param(name, str(each)) for name, each in flatten(config).items()]
+        taken = {re.sub(r"[^\w.\- ]", "_", name): str(each) for name, each in flatten(config).items()}
+        settings = [self._mlflow.entities.Param(name, text) for name, text in taken.items()]
+        self._pause_ends = 0.0  # the last occasion
         for first in range(0, len(settings), MOST):
             self._send(self._client.log_batch, params=settings[first : first + MOST])
         self.scalars({f"summary/{name}": each for name, each in metrics.items()}, 0)
@@ -172,13 +176,22 @@ class MlflowLog(Logger):
 
     def close(self) -> None:
         """End the run."""
+        self._pause_ends = 0.0
         self._send(self._client.set_terminated, self._status)
 
     def _send(self, method: Callable[..., object], *arguments: Any, **named: Any) -> None:
-        """Call a method of the client for this run; a lost server is warned of once, and ends no training."""
+        """Call a method of the client for this run; a lost server is warned of once, and ends no training.
+
+        It does not hold it up either: after a call that hung, others are left out for a while.
+        """
+        started = time.monotonic()
+        if started < self._pause_ends:
+            return
         try:
             method(self._run, *arguments, **named)
         except (self._mlflow.MlflowException, OSError) as error:
             if not self._lost:
                 print_message("train", f"warning: logger=mlflow misses points: {reason_of(error)}")
             self._lost = True
+            if (failed := time.monotonic()) > started + SLOW:
+                self._pause_ends = failed + PAUSE

@@ -11,7 +11,7 @@ from contextlib import suppress
 from importlib.util import find_spec
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 from command_line import in_process
@@ -128,15 +128,27 @@ def test_a_lost_server_of_mlflow_ends_no_training(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     mlflow = pytest.importorskip("mlflow", reason="it is an extra")
-    log = LOGGERS.find("mlflow")(tmp_path)
+    log, calls = LOGGERS.find("mlflow")(tmp_path), []
 
     def lost(*_: object, **__: object) -> None:
+        calls.append(1)
         raise mlflow.MlflowException("no answer")
 
     monkeypatch.setattr(log._client, "log_batch", lost)
     log.scalars({"score": 1.0}, 1)
     log.scalars({"score": 2.0}, 2)
     assert capsys.readouterr().err.count("warning: logger=mlflow misses points: no answer") == 1
+    assert len(calls) == 2
+    monkeypatch.setattr("cartpole_rl.reporting.trackers.SLOW", 0)  # as if it hung
+    for step in (3, 4):
+        log.scalars({"score": 3.0}, step)
+    assert len(calls) == 3
+    monkeypatch.undo()
+    log.hparams({"pole": {"rod (30 cm)": 0.3}}, {"score": 4.0})
+    log.close()
+    run = log._client.get_run(log._run)
+    assert (run.data.params, run.info.status) == ({"pole.rod _30 cm_": "0.3"}, "FINISHED")
+    assert run.data.metrics == {"summary/score": 4.0}
 
 
 def stored(data: bytes) -> Iterator[bytes]:
@@ -178,7 +190,8 @@ def test_a_failed_training_has_failed_in_wandb(tmp_path: Path) -> None:
     pytest.importorskip("wandb", reason="it is an extra")
     from wandb.proto.wandb_internal_pb2 import Record
 
-    log = LOGGERS.find("wandb")(tmp_path)
+    (tmp_path / "wandb_run.txt").touch()  # as a power cut may leave it
+    log = LOGGERS.find("wandb")(tmp_path, 1)
     log.fail(LearningError("diverged"))
     log.close()
     (file,) = tmp_path.glob("wandb/offline-run-*/*.wandb")
@@ -196,6 +209,30 @@ def test_a_missing_library_is_one_line(name: str, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(ConfigError, match=f"logger={name} needs {name}: pip install {name}"):
         LOGGERS.find(name)(tmp_path)
+
+
+class Noted:
+    """A logger that notes its calls, and fails to close."""
+
+    calls: ClassVar[list[str]] = []
+
+    def __init__(self, folder: Path, purge_step: int | None = None) -> None:
+        self.calls.append("open")
+
+    def close(self) -> None:
+        self.calls.append("close")
+        raise OSError("disk full")
+
+
+class Other(Noted): ...
+
+
+def test_each_logger_is_opened_once_and_closed_whatever_the_others_do(tmp_path: Path) -> None:
+    with pytest.raises(OSError, match="disk full"):
+        Loggers((Noted, Other, Noted), tmp_path).close()
+    with pytest.raises(ZeroDivisionError):
+        Loggers((Noted, lambda *_: 1 / 0), tmp_path)
+    assert Noted.calls == ["open", "open", "close", "close", "open", "close"]
 
 
 def test_several_are_a_list(tmp_path: Path) -> None:
