@@ -30,14 +30,15 @@ from cartpole_rl.composition import as_mapping, is_completing, reading_conf, tas
 from cartpole_rl.errors import CartPoleError, ConfigError
 from cartpole_rl.exits import OF_HYDRA, exit_with_message, is_defect, one_line
 from cartpole_rl.files import write_text
-from cartpole_rl.run_folder import ERROR
+from cartpole_rl.run_folder import CONFIG, ERROR, MULTIRUN
 from cartpole_rl.settings import Settings
 from cartpole_rl.terminal import print_message, program
 
 MODES = {"-m", "--multirun", "-r", "--run", "-c", "--cfg", "-i", "--info", "-sc", "--shell-completion"}
 NOT_ENDED = "it was killed or interrupted, or is still running"
 
-LONGEST_NAME = 150  # characters; file systems take 255
+SQLITE = "sqlite:///"  # before the path of a study of Optuna's
+LONGEST_NAME = 150  # bytes; file systems take 255
 
 
 def run_folder(command: str, label: Any, resume: Any = None) -> str:
@@ -89,7 +90,7 @@ def job_name(number: int, overrides: list[str] | ListConfig, constant: Collectio
     given = (word for word in task_overrides(overrides) if "=" in word and not is_completing(word))
     swept = (word for word in given if word.split("=")[0] not in constant)
     plain = (re.sub(r"[^\w.+-]+", "-", word).strip("-") for word in swept)
-    return "_".join((str(number), *plain))[:LONGEST_NAME]
+    return "_".join((str(number), *plain)).encode()[:LONGEST_NAME].decode(errors="ignore")
 
 
 OmegaConf.register_new_resolver("run_folder", run_folder, use_cache=True)
@@ -112,17 +113,30 @@ class SweepStart(Callback):
         """
         try:
             check_jobs(config, SweepStart.schema)
+            SweepStart.folder = folder = Path(config.hydra.sweep.dir)
+            constant = config.hydra.job.config.override_dirname.exclude_keys
+            check_folder(folder, [job_name(*job, constant) for job in enumerate(jobs_of(config))])
         except (ConfigError, *OF_HYDRA) as error:
             exit_with_message(SweepStart.command, error, kinds(SweepStart.schema, "plant"))
-        SweepStart.folder = Path(config.hydra.sweep.dir)
-        _ = config.hydra.job.config.override_dirname.exclude_keys
+        if not (folder / MULTIRUN).exists():  # not every sweeper of Hydra writes it
+            folder.mkdir(parents=True, exist_ok=True)
+            OmegaConf.save(config, folder / MULTIRUN)
+        storage = OmegaConf.select(config, "hydra.sweeper.storage")
+        if isinstance(storage, str) and storage.startswith(SQLITE):
+            Path(storage.removeprefix(SQLITE)).parent.mkdir(parents=True, exist_ok=True)
+
+
+def check_folder(folder: Path, names: Sequence[str]) -> None:
+    """Raise ConfigError if the folder of a sweep holds a run of the name of one of its jobs."""
+    for name in names:
+        if (folder / name / CONFIG).exists():
+            raise ConfigError(f"hydra.sweep.dir={folder}: it holds {name} already; give another folder")
 
 
 def check_jobs(config: DictConfig, schema: type[Settings]) -> None:
     """Raise for the first job of a sweep with a wrong setting, unless its sweeper chooses while it runs."""
-    loader = GlobalHydra.instance().config_loader()
     for job in jobs_of(config):
-        composed = loader.load_sweep_config(config, job)
+        composed = GlobalHydra.instance().config_loader().load_sweep_config(config, job)
         with read_write(composed), open_dict(composed):
             del composed["hydra"]
         if composed.get("resume") is not None:
@@ -222,7 +236,7 @@ def _report(name: str) -> int:
 
 def _jobs() -> list[Path]:
     """Return the run folders of the sweep, in the order of their numbers; none outside of a sweep."""
-    if SweepStart.folder is None:
+    if SweepStart.folder is None or not SweepStart.folder.is_dir():
         return []
     jobs = (path for path in SweepStart.folder.iterdir() if path.is_dir() and path.name[0] != ".")
     return sorted(jobs, key=lambda job: [int(number) for number in re.findall(r"^\d+", job.name)])

@@ -27,7 +27,7 @@ from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import LinkError
 from cartpole_rl.evaluation.episodes import Policy, run_episodes
 from cartpole_rl.files import claimed
-from cartpole_rl.sweeps import constant_settings, job_name, run_folder
+from cartpole_rl.sweeps import LONGEST_NAME, constant_settings, job_name, run_folder
 from cartpole_rl.tasks.episode import Episode
 
 LONGER = ("learning.transitions=2000000", "learning.evaluations=2000")  # than the test
@@ -210,6 +210,7 @@ def test_names_of_jobs_show_what_differs(monkeypatch: pytest.MonkeyPatch) -> Non
     job = ["compile=False", "agent.hidden=[64,64]", "run=runs/a", "seed=0"]
     assert job_name(7, job, constant_settings()) == "7_agent.hidden-64-64_run-runs-a_seed-0"
     assert job_name(0, ["compile=False"], constant_settings()) == "0"
+    assert len(job_name(0, [f"label={200 * 'é'}"], ()).encode()) <= LONGEST_NAME
 
 
 def test_runs_that_start_in_the_same_second_do_not_share_a_folder(

@@ -5,9 +5,11 @@ from pathlib import Path
 
 import pytest
 from command_line import in_process
+from omegaconf import OmegaConf
 
 from cartpole_rl.composition import EXTRAS
-from cartpole_rl.sweeps import as_multirun
+from cartpole_rl.reporting.loggers import sweep_of
+from cartpole_rl.sweeps import SweepStart, _jobs, as_multirun
 from cartpole_rl.workflows.config import TrainConfig
 
 FAILS = "cart.cart_mass=-1"  # at once, by a check of the job: the type is right
@@ -73,6 +75,27 @@ def test_a_defect_in_a_job_leaves_its_traceback(tmp_path: Path, monkeypatch: pyt
     assert done.err.splitlines()[-1] == "cartpole-train: 1_seed-1: ZeroDivisionError: division by zero"
     (error,) = tmp_path.glob("runs/train/*_multirun/1_seed-1/error.txt")
     assert "Traceback" in error.read_text()
+
+
+def test_a_sweep_leaves_the_runs_of_an_earlier_one_alone(tmp_path: Path) -> None:
+    (run := tmp_path / "sweep/1_seed-1").mkdir(parents=True)
+    (run / "config.yaml").touch()
+    done = in_process("train", "-m", "seed=0,1", "hydra.sweep.dir=sweep", folder=tmp_path)
+    assert done.complaint.endswith("hydra.sweep.dir=sweep: it holds 1_seed-1 already; give another folder")
+    assert [*run.iterdir()] == [run / "config.yaml"]
+    assert [*run.parent.iterdir()] == [run]
+
+
+def test_every_sweeper_gets_its_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As Optuna's, which makes none, and writes no multirun.yaml."""
+    monkeypatch.setattr(SweepStart, "folder", folder := tmp_path / "sweep")
+    assert _jobs() == []
+    sweeper = {"_target_": "OptunaSweeper", "storage": f"sqlite:///{tmp_path}/runs/optuna.db"}
+    job = {"config": {"override_dirname": {"exclude_keys": []}}}
+    given = {"sweeper": sweeper, "sweep": {"dir": str(folder)}, "job": job}
+    SweepStart().on_multirun_start(OmegaConf.create({"hydra": given}))
+    assert sweep_of(folder / "0") == "sweep"
+    assert (tmp_path / "runs").is_dir()
 
 
 def test_commands_without_a_run_folder_report_too(tmp_path: Path) -> None:
