@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
+from torch.nn.parameter import is_lazy
 from torchrl.data import Categorical
 from torchrl.modules import QValueActor
 from torchrl.objectives import DQNLoss
@@ -99,13 +100,22 @@ class QAgent(nn.Module):
 def check_network(name: str, network: Any, observation_size: int, actions: int) -> None:
     """Raise ConfigError for a network that gives no action values [N, A], or acts otherwise in training.
 
-    Only trainable weights are averaged, and carts must not change each other's values. Copies are tried, with
-    other weights: a last layer of zeros hides what is before it. Neither the network nor torch's generator
-    changes.
+    Only trainable weights are averaged, and carts must not change each other's values. Each trainable weight
+    needs a gradient and one name. Copies are tried, with other weights: a last layer of zeros hides what is
+    before it. Neither the network nor torch's generator changes.
     """
     said = f"agent.network={name}:"
     if not isinstance(network, nn.Module):
         raise ConfigError(f"{said} it returned {type(network).__name__}; return a torch.nn.Module")
+    names: dict[Tensor, str] = {}
+    for weight_name, weight in network.named_parameters(remove_duplicate=False):
+        if is_lazy(weight):
+            raise ConfigError(f"{said} it has no size for {weight_name} yet; use Linear, not LazyLinear")
+        if (first := names.setdefault(weight, weight_name)) != weight_name and weight.requires_grad:
+            raise ConfigError(
+                f"{said} it has one weight as {first} and as {weight_name}, which would be trained twice; "
+                "give each layer its own"
+            )
     generator = torch.Generator().manual_seed(0)
     observations = torch.randn(TRIED, observation_size, generator=generator)
     try:
@@ -114,7 +124,11 @@ def check_network(name: str, network: Any, observation_size: int, actions: int) 
             for weight in filter(Tensor.is_floating_point, tried.parameters()):
                 weight.add_(0.1 * torch.randn(weight.shape, generator=generator))
             training, driving, one = (copy.deepcopy(tried).train(each) for each in (True, False, False))
-            values, driven, alone = training(observations), driving(observations), one(observations[:1])
+            with torch.enable_grad():
+                values = training(observations)
+            if getattr(values, "requires_grad", False):
+                values.backward(torch.ones_like(values))
+            driven, alone = driving(observations), one(observations[:1])
     except Exception as error:  # of someone's own code
         reason = f"{type(error).__name__}: {reason_of(error)}"
         raise ConfigError(f"{said} it cannot read observations [N, {observation_size}]: {reason}") from error
@@ -123,6 +137,12 @@ def check_network(name: str, network: Any, observation_size: int, actions: int) 
         raise ConfigError(
             f"{said} it gave {shape} for observations [{TRIED}, {observation_size}]; "
             f"give action values [{TRIED}, {actions}]"
+        )
+    weights = training.named_parameters()
+    if unused := [each for each, weight in weights if weight.requires_grad and weight.grad is None]:
+        raise ConfigError(
+            f"{said} it gives action values without a gradient by {unused[0]}; leave that weight out, or "
+            "freeze it by requires_grad_(False)"
         )
     alike = partial(torch.allclose, rtol=1e-3, atol=1e-3, equal_nan=True)
     pairs = [(values, driven), (values[:1], alone), *zip(training.buffers(), tried.buffers(), strict=True)]

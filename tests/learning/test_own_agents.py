@@ -83,6 +83,11 @@ def zeroed(settings, signs, actions, frames):
     torch.nn.init.zeros_(network[-1].weight)
     return network
 
+def spare(settings, signs, actions, frames):
+    network = steady(settings, signs, actions, frames)
+    network[0].head = torch.nn.Linear(1, 1)
+    return network
+
 class Stateful(torch.nn.Module):
     """Has a recurrent state, of as many carts as it first met."""
 
@@ -96,6 +101,7 @@ class Stateful(torch.nn.Module):
 
 dropping, normed = layers(torch.nn.Dropout(0.1)), layers(torch.nn.BatchNorm1d(32))
 mixing = layers(torch.nn.BatchNorm1d(32, affine=False, track_running_stats=False))
+twice, lazy = layers(*2 * [torch.nn.Linear(32, 32)]), layers(torch.nn.LazyLinear(32))
 steady, short, no_module = layers(torch.nn.LayerNorm(32)), layers(less=1), lambda *given: None
 
 class Lines:
@@ -187,6 +193,9 @@ def test_what_cannot_be_one_is_refused(setting: dict[str, str], message: str) ->
         *((name, "acts otherwise in training than afterwards") for name in ("dropping", "normed", "zeroed")),
         ("mixing", r"cannot read observations \[N, \d+\]: ValueError: Expected more than 1 value"),
         ("short", r"gave \[64, 8\] for observations \[64, \d+\]; give action values \[64, 9\]"),
+        ("spare", "gives action values without a gradient by 0.head.weight; leave that weight out"),
+        ("twice", "has one weight as 1.weight and as 2.weight, which would be trained twice; give"),
+        ("lazy", "has no size for 1.weight yet; use Linear"),
         ("no_module", "returned NoneType; return a torch.nn.Module"),
     ],
 )
