@@ -62,8 +62,8 @@ class _GymnasiumImportHook(MetaPathFinder):
         run_module = loader.exec_module
 
         def run_and_register(module: ModuleType) -> None:
+            run_module(module)  # if it fails, the next import is waited for
             sys.meta_path.remove(self)
-            run_module(module)
             register()
 
         loader.exec_module = run_and_register  # type: ignore[method-assign]

@@ -295,6 +295,7 @@ def wait_for_weights(
                 take(news, cart.files, tuned)
             elif news.learned > tuned.logged:  # a learner that outlived its session sends all of its news
                 cart.log_learning(news.scalars, news.learned)
+                tuned.logged = news.learned
         lacking = number - tuned.learned
         if lacking <= 0:
             return

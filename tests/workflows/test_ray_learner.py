@@ -182,11 +182,14 @@ def test_weights_that_arrived_are_kept_for_a_resumption(session: Session) -> Non
 
 @pytest.mark.parametrize(("version", "curves"), [(0, [0, 1, 2, 3, 4]), (2, [3, 4])])
 def test_a_resumption_logs_no_curve_again(version: int, curves: list[int], session: Session) -> None:
-    """Its learner has waited, and sends all of its news to a session that has got none of them."""
+    """Its learner has waited, and sends all of its news to a session that has got none of them.
+
+    Another one then takes over, and begins with the newest weights.
+    """
     session.files.save({"agent": session.tuned.agent.state_dict(), NAME: "run"}, version)
     saved = load_training(session.files.folder, FINETUNING_FORMAT)
     session.tuned = TunedAgent(TRAINING, session.tuned.start, saved)
-    for each in range(5):
+    for each in (*range(5), 4):
         session.offer(each)
     session.tune(lambda count, looks: None)
     assert session.cart.curves == curves
