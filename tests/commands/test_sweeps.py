@@ -80,7 +80,8 @@ def test_a_defect_in_a_job_leaves_its_traceback(tmp_path: Path, monkeypatch: pyt
 def test_a_sweep_leaves_the_runs_of_an_earlier_one_alone(tmp_path: Path) -> None:
     (run := tmp_path / "sweep/1_seed-1").mkdir(parents=True)
     (run / "config.yaml").touch()
-    done = in_process("train", "-m", "seed=0,1", "hydra.sweep.dir=sweep", folder=tmp_path)
+    words = ("-m", "seed=0,1", "hydra.sweep.dir=sweep")
+    done = in_process("train", *words, folder=tmp_path, function=lambda: None)
     assert done.complaint.endswith("hydra.sweep.dir=sweep: it holds 1_seed-1 already; give another folder")
     assert [*run.iterdir()] == [run / "config.yaml"]
     assert [*run.parent.iterdir()] == [run]
