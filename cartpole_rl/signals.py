@@ -14,8 +14,8 @@ from contextlib import contextmanager
 from types import FrameType
 
 # s after a signal during which others are ignored: they would interrupt the unwinding. Stopping a cart that
-# does not answer takes up to 5.5 s: LONGEST_STOP, LAST_STOP and LONGEST_WRITE in `plants.serial`.
-UNWINDING = 6.0
+# does not answer takes up to 7 s: LONGEST_STOP, LAST_STOP and LONGEST_WRITE in `plants.serial`.
+UNWINDING = 7.5
 AGAIN = 0.1  # s
 NUMBER = "signal_number"  # the attribute of an error that a signal raised
 PARENT_POLL = 0.5  # s

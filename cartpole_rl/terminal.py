@@ -1,5 +1,6 @@
 """The terminal: messages, questions, progress bars, and text that survives a shell and Hydra."""
 
+import errno
 import os
 import re
 import select
@@ -64,6 +65,16 @@ def print_message(verb: str, message: str) -> None:
     """Print one line of a verb's program on stderr; do nothing if the terminal is closed."""
     with suppress(OSError):
         print(f"{program(verb)}: {message}", file=sys.stderr)
+
+
+@contextmanager
+def unless_closed() -> Iterator[None]:
+    """Leave the `with` quietly where a print finds the terminal closed."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno != errno.EIO:
+            raise
 
 
 def as_word(name: str, value: object) -> str:

@@ -23,7 +23,7 @@ from cartpole_rl.run_folder import (
     write_config,
 )
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.terminal import as_word, print_loop_time, print_results, shown, words_given
+from cartpole_rl.terminal import as_word, print_loop_time, print_results, shown, unless_closed, words_given
 from cartpole_rl.workflows.config import EvaluateConfig
 from cartpole_rl.workflows.episodes import Evaluation, Repetition, prepared
 from cartpole_rl.workflows.poles import POLES, emulated_words, emulator_for, plant_words
@@ -53,7 +53,8 @@ def evaluate(config: EvaluateConfig, folder: Path) -> None:
                     onboard.append(episode)
     except BaseException:  # after a broken link or Ctrl-C, the episodes until then are reported
         if episodes:
-            report_evaluation(evaluation, episodes, onboard, folder, next_command=None)
+            with unless_closed():
+                report_evaluation(evaluation, episodes, onboard, folder, next_command=None)
         raise
     report_evaluation(evaluation, episodes, onboard, folder, next_command(evaluation))
 
@@ -70,14 +71,16 @@ def report_evaluation(
     link = evaluation.env.plant.link_figures()
     mp4 = evaluation.config.animation.mp4
     heading = f"plant={plant}, {count_text(len(episodes))}"
-    summary, _ = summarized(episodes, settings.task.x_max)  # is printed first: figures can fail
-    if onboard:
-        by_board, _ = summarized(onboard, settings.task.x_max)
-        print(score_columns({"this computer": summary, "on the board": by_board}, heading))
-        print(same_motors(onboard))
-    else:
-        print(score_table(summary, heading))
-    report_episodes(folder, episodes, plant, settings.pole, settings.task, link, onboard=onboard, mp4=mp4)
+    summary, _ = summarized(episodes, settings.task.x_max)
+    try:
+        report_episodes(folder, episodes, plant, settings.pole, settings.task, link, onboard=onboard, mp4=mp4)
+    finally:  # figures can fail, and so can printing, where the terminal has been closed
+        if onboard:
+            by_board, _ = summarized(onboard, settings.task.x_max)
+            print(score_columns({"this computer": summary, "on the board": by_board}, heading))
+            print(same_motors(onboard))
+        else:
+            print(score_table(summary, heading))
     if settings.guard.active:
         print(f"track guard: {settings.guard.active}")
     for line in cut_off([*episodes, *onboard]):

@@ -14,7 +14,7 @@ from cartpole_rl.errors import LinkError, PlantError
 from cartpole_rl.plants.serial.connection import WATCHDOG_PERIODS, Connection
 from cartpole_rl.plants.serial.errors import RefusedError, check_limits, check_rig, fault_error
 from cartpole_rl.plants.serial.link import SerialLink, now
-from cartpole_rl.plants.serial.port import UsbPort, found_ports, open_port, port_of, resolved_port
+from cartpole_rl.plants.serial.port import UsbPort, found_ports, is_name_of, open_port, port_of, resolved_port
 from cartpole_rl.plants.serial.tracking import LinkStatistics, StateTracker
 from cartpole_rl.plants.settings import SerialSettings
 from cartpole_rl.rig.hardware import Hardware, nominal_hardware
@@ -111,7 +111,7 @@ class SerialCart:
                 self._abandon()
                 raise
         link.statistics = self.statistics
-        self._usb = self._usb or next((each for each in found_ports() if each.device == self.port), None)
+        self._usb = self._usb or next((x for x in found_ports() if is_name_of(self.port, x.device)), None)
         if self._required_policy is not None:
             self.check_policy(self._required_policy)
         return self.information
@@ -390,8 +390,8 @@ class SerialCart:
         """Raise LinkError if this computer did not answer the cart for too long."""
         if seconds > self.longest_suspension:
             raise LinkError(
-                f"this computer did not answer the cart on {self.port} for {seconds:.1f} s; end what keeps "
-                "it busy, and do not suspend a command that drives"
+                f"this computer did not answer the cart on {self.port} for {seconds:.1f} s, or heard nothing "
+                "of it: end what keeps it busy, do not suspend a command that drives, check the cable"
             )
 
     def _is_homing(self) -> bool:

@@ -4,6 +4,7 @@ Time is the cart's: `dt` comes from STATE's clock. `preparation.py` brings the c
 episode. Every ending, by the track, a fault, the link or `close`, sets the motor to 0 and disarms first.
 """
 
+import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
@@ -35,6 +36,8 @@ from cartpole_rl.rig.hardware import LARGEST_MOTOR, Hardware, hardware_of
 from cartpole_rl.rig.parameters import completed
 from cartpole_rl.tasks.episode import Ending
 from cartpole_rl.wire.messages import Fault, Flags, State, seconds_between, ticks_between, went_back
+
+REOPENED = 0.1  # s between two attempts to open the port of a cart that was lost
 
 
 class SerialPlant(OneCartPlant):
@@ -306,18 +309,28 @@ class SerialPlant(OneCartPlant):
         return turn * round((self._state.pole_counts - start) / turn)
 
     def _reach(self) -> None:
-        """Stop the cart; connect again if the link was lost. Raises LinkError."""
+        """Stop the cart; connect again if the link was lost, also if its port is gone for a moment.
+
+        Raises LinkError.
+        """
         if self.cart.is_open:
             with suppress(LinkError):
                 self.cart.stop()
                 return
             self.cart.close()
         self._preparation.require_homing()
-        try:
-            self._connect()
-        except (PortError, LinkError) as error:
-            lost = f" ({self.last_error})" if self.last_error else ""
-            raise LinkError(f"the link to the cart was lost{lost} and not restored: {error}") from error
+        lost = f" ({self.last_error})" if self.last_error else ""
+        deadline = time.monotonic() + self.settings.connect_timeout
+        while True:
+            try:
+                self._connect()
+                return
+            except (PortError, LinkError) as error:
+                if not isinstance(error, PortError) or time.monotonic() > deadline:
+                    raise LinkError(
+                        f"the link to the cart was lost{lost} and not restored: {error}"
+                    ) from error
+            time.sleep(REOPENED)
 
     def _why_lost(self) -> str:
         """Return the reason why the process that serves the cart has ended; empty if it has not."""
@@ -325,6 +338,8 @@ class SerialPlant(OneCartPlant):
 
     def _connect(self) -> None:
         """Open the port and check which rig the cart is. Raises PortError, LinkError, NotReadyError."""
+        if self._owned is not None and self._owned.died:
+            raise LinkError(self._owned.died)  # its port may be another process's by now
         try:
             self.cart.open()
         except (PortError, LinkError) as error:

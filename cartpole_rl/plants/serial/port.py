@@ -117,6 +117,8 @@ def port_of(earlier: UsbPort, port: str) -> str:
     """
     ports = found_ports()
     paths = [each.device for each in ports if each.identity == earlier.identity]
+    if any(is_name_of(port, path) for path in paths):
+        return port  # a link follows its cart
     if earlier.device in paths:
         return earlier.device
     if len(paths) == 1 and port == AUTO:
@@ -128,6 +130,13 @@ def port_of(earlier: UsbPort, port: str) -> str:
         f"the cart's port ({described(earlier)}) is gone; there are {named(ports) or 'none'}: plug the same "
         f"cart in again{where}, or start the command again for another one"
     )
+
+
+def is_name_of(port: str, device: str) -> bool:
+    """Return True if `port` is `device`, a link to it, or its other name on macOS or in Windows's letters."""
+    if os.name == "nt":
+        return port.lower() == device.lower()
+    return os.path.realpath(port).replace("/dev/tty.", "/dev/cu.") == device
 
 
 def only_cart(ports: Iterable[UsbPort]) -> str:

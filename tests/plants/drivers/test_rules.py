@@ -299,6 +299,20 @@ def test_a_board_that_homes_may_set_its_count() -> None:
     assert bridge.played.sent == sent
 
 
+def test_a_board_whose_homing_is_broken_off_is_stopped_before_it_is_slowed_down() -> None:
+    """While it homes it may take no commands."""
+    bridge = Playing(homing="board", sends="acceleration", full=12.0)
+    bridge._stand_in.board_homes = True
+    bridge.measure(*range(0, -4000, -40))
+    stops, sent = bridge.played.stops, [*bridge.played.sent]
+    bridge._stand_in.board_homes = False
+    bridge._command()
+    assert (bridge.played.stops, bridge.played.sent) == (stops + 1, sent)
+    bridge.measure(-4040, -4080)
+    assert bridge.played.stops == stops + 1
+    assert bridge.played.sent[-1] > 0  # it still runs to the left
+
+
 def test_a_count_that_is_set_elsewhere_ends_the_homing() -> None:
     bridge = Playing()
     bridge.measure(8000, 8001)

@@ -1,8 +1,10 @@
 """The plant on a scripted cart: endings, clocks and faults. On the emulated cart: ../test_emulated.py."""
 
+import threading
 from collections.abc import Iterable, Iterator
 from contextlib import closing
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -430,8 +432,19 @@ def test_a_silent_cart_truncates_with_the_last_counts_and_can_come_back(
     assert plant.reset()["counts"].tolist() == [[42, HANGING]]
 
 
+def test_a_port_that_is_gone_for_a_moment_is_opened_again(peer: CartPeer, tmp_path: Path) -> None:
+    port = tmp_path / "port"
+    port.symlink_to(peer.port)
+    with closing(SerialPlant(quick_settings(str(port), connect_timeout=60.0))) as plant:
+        plant.reset()
+        plant.cart.close()  # as after a lost link
+        port.unlink()
+        threading.Timer(0.2, port.symlink_to, [peer.port]).start()
+        assert not plant.reset()["truncated"]
+
+
 class Owned:
-    closed = False
+    closed, died = False, ""
 
     def death(self) -> str:
         return ""

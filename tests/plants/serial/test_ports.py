@@ -6,6 +6,7 @@ import re
 import struct
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from serial.tools.list_ports_common import ListPortInfo
@@ -136,14 +137,22 @@ def test_a_board_without_its_own_serial_number_is_known_by_its_socket(
                 port_of(first, given)
 
 
-def test_another_cart_is_not_driven_after_the_first_was_unplugged(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("given", ["auto", "a link"])
+def test_another_cart_is_not_driven_after_the_first_was_unplugged(
+    given: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with CartPeer() as first, CartPeer() as second:
+        link = tmp_path / "cart"
+        link.symlink_to(first.port)
         plugged = [replace(FTDI, device=first.port)]
         for module in (port, cart_module):
             monkeypatch.setattr(module, "found_ports", lambda: plugged)
-        cart = SerialCart(quick_settings("auto"))
-        cart.open()
-        cart.close()
+        cart = SerialCart(quick_settings(given if given == "auto" else str(link)))
+        for _ in range(2):
+            cart.open()
+            cart.close()
+        link.unlink()
+        link.symlink_to(second.port)
         plugged[:] = [replace(FTDI, device=second.port, serial_number="other")]
         with pytest.raises(PortError, match="plug the same cart in again"):
             cart.open()
