@@ -75,7 +75,7 @@ class Connection:
         self._state_since_refusal = True
 
     def shake_hands(self) -> Info:
-        """Send STOP until the cart answers it, then HELLO. Whatever a booting board prints before is ignored.
+        """Send STOP until the cart answers it, then HELLO. A booting board may print, or take no bytes.
 
         STOP comes first: a host that died may have left the cart armed, with a policy on its board that any
         accepted frame wakes. HELLO waits for its answer, as STOP may be lost.
@@ -86,16 +86,21 @@ class Connection:
         stopped = 0
         while now() < deadline:
             self._answers.clear()
-            self.link.write(END)  # ends a partial frame that the cart may have read
+            try:
+                self.link.write(END)  # ends a partial frame that the cart may have read
+                sent = self.link.send(Stop() if stopped < ACKNOWLEDGED_STOPS else Hello())
+            except WriteTimeoutError:
+                if now() < deadline:
+                    continue
+                raise
             until = min(deadline, now() + pause)
             if stopped < ACKNOWLEDGED_STOPS:
-                stops.append(self.link.send(Stop()))
+                stops.append(sent)
                 answer = self._await_answer(until, Stop.TYPE, stops, Ack)
                 if answer is not None:
                     stopped += 1
                     stops.remove(answer.sequence)
                 continue
-            self.link.send(Hello())
             information = self._await_answer(until, Hello.TYPE, (), Info)
             if information is not None:
                 return information

@@ -226,6 +226,9 @@ def test_stop_is_repeated_where_the_port_takes_no_bytes_for_a_while(monkeypatch:
         full.extend([True] * 3)
         with pytest.raises(WriteTimeoutError):
             cart.info()
+        full[:] = [True] * 3  # as a board does that boots
+        assert cart._connection.shake_hands() == cart.information
+        assert not full
 
 
 def test_an_interrupted_end_sends_stop_once_more(monkeypatch: pytest.MonkeyPatch) -> None:
