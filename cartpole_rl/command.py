@@ -39,7 +39,7 @@ from cartpole_rl.exits import (
 from cartpole_rl.run_folder import CHECKPOINTS, RESUME, use_of
 from cartpole_rl.settings import Settings
 from cartpole_rl.sweeps import as_multirun, is_job, run_as_job, shown_jobs, sweep
-from cartpole_rl.terminal import program, waiting
+from cartpole_rl.terminal import noting, program, waiting
 
 if TYPE_CHECKING:
     from cartpole_rl.cli import Verb
@@ -97,7 +97,7 @@ def run_job(
             function = verb.find(verb.function)
         return call(function, config=config, folder=folder, words=words)
 
-    with job_signals():
+    with job_signals(), noting(words):
         try:
             return run_as_job(name, folder, work) if is_job() else work()
         except (*EXPECTED, KeyboardInterrupt, Terminated) as ended:

@@ -73,6 +73,7 @@ WORD = re.compile(r"([a-z_]+)=(.+)", re.DOTALL)
 NAME = re.compile(r"(?!(?:null|true|false|nan|inf)$)[a-z_][\w-]*", re.IGNORECASE | re.ASCII)
 OWN = "own"  # the group of what a user's own choices give: own/cart, own/pole, ...
 KEPT = "emulator.given="
+MULTIRUN_FLAGS = {"-m", "--multirun"}
 RESUMED = ("plant", "learner")  # groups of which a resumed run takes single settings
 FRICTIONS = ("cart_friction", "pole_friction")  # groups whose `parameters` replace numbers of `cart`
 ONE_OF = {  # settings of a group, or of each of its parameters, of which one is given
@@ -217,7 +218,7 @@ class _OwnChoices:
 
     def completed(self, words: list[str]) -> list[str]:
         """Return the words, and those by which what the user gave outlasts other choices."""
-        all_words = [*self.params, *words]
+        all_words = [*(self.params if MULTIRUN_FLAGS & {*words} else ()), *words]
         keys = {key_of(word) for word in all_words}
         frictions = [group for group in FRICTIONS if self.groups.get(group) is not None or group in keys]
         groups = sorted(self.given.keys() - {"sweep"}, key=lambda group: (group in WHOLE, group in FRICTIONS))
@@ -340,7 +341,9 @@ class _OwnChoices:
             return sweep
         words = {name: self.with_names(f"{name}={value}") for name, value in params.items()}
         self.params += words.values()
-        texts = {name: words[name].partition("=")[2] for name in params if isinstance(params[name], str)}
+        texts = {
+            name: word.partition("=")[2] for name, word in words.items() if word != f"{name}={params[name]}"
+        }
         return merged(sweep, {"hydra": {"sweeper": {"params": texts}}})
 
     def _put(self, group: str, name: str, node: Any, package: str | None) -> None:

@@ -26,7 +26,14 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict, read_write
 
 from cartpole_rl.checking import kinds, validated
-from cartpole_rl.composition import as_mapping, is_completing, reading_conf, task_overrides
+from cartpole_rl.composition import (
+    MULTIRUN_FLAGS,
+    as_mapping,
+    is_completing,
+    own_folder,
+    reading_conf,
+    task_overrides,
+)
 from cartpole_rl.errors import CartPoleError, ConfigError
 from cartpole_rl.exits import OF_HYDRA, exit_with_message, is_defect, one_line
 from cartpole_rl.files import write_text
@@ -34,7 +41,7 @@ from cartpole_rl.run_folder import CONFIG, ERROR, MULTIRUN
 from cartpole_rl.settings import Settings
 from cartpole_rl.terminal import print_message, program
 
-MODES = {"-m", "--multirun", "-r", "--run", "-c", "--cfg", "-i", "--info", "-sc", "--shell-completion"}
+MODES = MULTIRUN_FLAGS | {"-r", "--run", "-c", "--cfg", "-i", "--info", "-sc", "--shell-completion"}
 NOT_ENDED = "it was killed or interrupted, or is still running"
 
 SQLITE = "sqlite:///"  # before the path of a study of Optuna's
@@ -114,23 +121,29 @@ class SweepStart(Callback):
         try:
             check_jobs(config, SweepStart.schema)
             SweepStart.folder = folder = Path(config.hydra.sweep.dir)
-            constant = config.hydra.job.config.override_dirname.exclude_keys
-            check_folder(folder, [job_name(*job, constant) for job in enumerate(jobs_of(config))])
-        except (ConfigError, *OF_HYDRA) as error:
-            exit_with_message(SweepStart.command, error, kinds(SweepStart.schema, "plant"))
-        if not (folder / MULTIRUN).exists():  # not every sweeper of Hydra writes it
+            _ = config.hydra.job.config.override_dirname.exclude_keys
+            check_folder(config, folder)
             folder.mkdir(parents=True, exist_ok=True)
-            OmegaConf.save(config, folder / MULTIRUN)
-        storage = OmegaConf.select(config, "hydra.sweeper.storage")
-        if isinstance(storage, str) and storage.startswith(SQLITE):
-            Path(storage.removeprefix(SQLITE)).parent.mkdir(parents=True, exist_ok=True)
+            if not (folder / MULTIRUN).exists():  # not every sweeper of Hydra writes it
+                OmegaConf.save(config, folder / MULTIRUN)
+            storage = OmegaConf.select(config, "hydra.sweeper.storage")
+            if isinstance(storage, str) and storage.startswith(SQLITE):
+                Path(storage.removeprefix(SQLITE)).parent.mkdir(parents=True, exist_ok=True)
+        except (ConfigError, OSError, *OF_HYDRA) as error:
+            exit_with_message(SweepStart.command, error, kinds(SweepStart.schema, "plant"))
 
 
-def check_folder(folder: Path, names: Sequence[str]) -> None:
-    """Raise ConfigError if the folder of a sweep holds a run of the name of one of its jobs."""
-    for name in names:
-        if (folder / name / CONFIG).exists():
-            raise ConfigError(f"hydra.sweep.dir={folder}: it holds {name} already; give another folder")
+def check_folder(config: DictConfig, folder: Path) -> None:
+    """Raise ConfigError if a job of a sweep would write into a run that is in the sweep's `folder`."""
+    if not any(folder.rglob(CONFIG)):
+        return
+    for number, job in enumerate(jobs_of(config)):
+        composed = GlobalHydra.instance().config_loader().load_sweep_config(config, job)
+        with read_write(composed), open_dict(composed):
+            composed.hydra.job.num, composed.hydra.job.id = number, str(number)
+        run = folder / composed.hydra.sweep.subdir
+        if (run / CONFIG).exists():
+            raise ConfigError(f"{run}: it holds a run already; give another hydra.sweep.dir")
 
 
 def check_jobs(config: DictConfig, schema: type[Settings]) -> None:
@@ -170,15 +183,17 @@ def as_multirun(words: Sequence[str]) -> list[str]:
 
 def shown_jobs(command: str, words: Sequence[str]) -> list[list[str]]:
     """Return the command lines that show the settings of each job: those of `-m --cfg job`; else none."""
-    if {"-m", "--multirun"}.isdisjoint(words) or {"-c", "--cfg"}.isdisjoint(words):
+    if MULTIRUN_FLAGS.isdisjoint(words) or {"-c", "--cfg"}.isdisjoint(words):
         return []
     overrides = [word for word in words if "=" in word and not word.startswith("-")]
+    if folder := own_folder(words):
+        overrides.append(f"hydra.searchpath=[file://{folder}]")
     with reading_conf():
         loader = GlobalHydra.instance().config_loader()
         config = loader.load_configuration(command, overrides, RunMode.MULTIRUN)
         task = task_overrides(config.hydra.overrides.task)
         jobs = jobs_of(config) or [task]
-    others = [word for word in words if word not in (*task, "-m", "--multirun")]
+    others = [word for word in words if word not in {*task, *MULTIRUN_FLAGS}]
     return [[*job, *others] for job in jobs]
 
 

@@ -8,7 +8,7 @@ import shlex
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +16,7 @@ from typing import Any
 
 READER_LEFT = 141  # exit code, as of a program that SIGPIPE ends
 BLINK = 1.0  # s, between two updates of a line about work under way
+_words: list[str] = []  # of the command line, while a command runs
 _under_way: list["_Work"] = []  # the blocks of `waiting`, innermost last
 
 
@@ -206,9 +207,19 @@ def _write(text: str) -> None:
         sys.stderr.flush()
 
 
+@contextmanager
+def noting(words: Sequence[str]) -> Iterator[None]:
+    """Within the `with`, let `words` be those of the command line: in a job of a sweep, its own."""
+    _words[:] = words
+    try:
+        yield
+    finally:
+        _words.clear()
+
+
 def words_given(*settings: str) -> list[str]:
     """Return the words of the command line that give these settings or parts of them, quoted for a shell."""
-    names = ((re.split(r"[.=]", word.lstrip("+"))[0], word) for word in sys.argv[1:])
+    names = ((re.split(r"[.=]", word.lstrip("+"))[0], word) for word in _words)
     return [shlex.quote(word) for name, word in names if name in settings]
 
 

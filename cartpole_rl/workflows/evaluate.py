@@ -74,13 +74,14 @@ def report_evaluation(
     summary, _ = summarized(episodes, settings.task.x_max)
     try:
         report_episodes(folder, episodes, plant, settings.pole, settings.task, link, onboard=onboard, mp4=mp4)
-    finally:  # figures can fail, and so can printing, where the terminal has been closed
-        if onboard:
-            by_board, _ = summarized(onboard, settings.task.x_max)
-            print(score_columns({"this computer": summary, "on the board": by_board}, heading))
-            print(same_motors(onboard))
-        else:
-            print(score_table(summary, heading))
+    finally:  # figures can fail, and so can printing, which then hides no other error
+        with unless_closed():
+            if onboard:
+                by_board, _ = summarized(onboard, settings.task.x_max)
+                print(score_columns({"this computer": summary, "on the board": by_board}, heading))
+                print(same_motors(onboard))
+            else:
+                print(score_table(summary, heading))
     if settings.guard.active:
         print(f"track guard: {settings.guard.active}")
     for line in cut_off([*episodes, *onboard]):

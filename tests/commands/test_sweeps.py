@@ -82,7 +82,7 @@ def test_a_sweep_leaves_the_runs_of_an_earlier_one_alone(tmp_path: Path) -> None
     (run / "config.yaml").touch()
     words = ("-m", "seed=0,1", "hydra.sweep.dir=sweep")
     done = in_process("train", *words, folder=tmp_path, function=lambda: None)
-    assert done.complaint.endswith("hydra.sweep.dir=sweep: it holds 1_seed-1 already; give another folder")
+    assert done.complaint.endswith("sweep/1_seed-1: it holds a run already; give another hydra.sweep.dir")
     assert [*run.iterdir()] == [run / "config.yaml"]
     assert [*run.parent.iterdir()] == [run]
 

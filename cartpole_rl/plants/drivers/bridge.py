@@ -307,7 +307,7 @@ class Bridge:
         self._place = self._place_us = 0  # the count about which the cart stands, and since when
         self._measured = 0  # of the control period
         self._stops_left = STOPS  # whatever the board did before
-        self._board_homed = False  # at the last command
+        self._homing_stops = 0  # that a homing of the board needs yet, if it is broken off
 
     def listen(self) -> None:
         """Open and stop the board; learn how often it measures. Raises LinkError, PortError, ConfigError."""
@@ -597,14 +597,13 @@ class Bridge:
         if stand_in.board_homes:
             self._commands = self._new_commands()  # what was sent before counts no more
             self._stops_left = STOPS  # for a homing that is ended
-            self._board_homed = True
+            self._homing_stops = STOPS - 1  # the last one follows when the cart stands
             return
-        if self._board_homed:
-            self._board_homed = False
-            if not stand_in.homing:  # it was broken off
-                self._stops_left -= 1
-                self._stop_board_homing()
-                return
+        if stand_in.homing:
+            self._homing_stops = 0  # the board was done
+        elif self._homing_stops:
+            self._stop_board_homing()
+            return
         if stand_in.is_active:
             self._stops_left = STOPS
             if not silent and not stand_in.is_idle(now_us):
@@ -623,6 +622,8 @@ class Bridge:
 
     def _stop_board_homing(self) -> None:
         """Stop a board that may still home by itself: it takes no commands until then."""
+        self._homing_stops -= 1
+        self._stops_left -= 1
         self._driver.stop()
         self._recent.clear()
         self._commands = self._new_commands()
@@ -659,7 +660,7 @@ class Bridge:
         self._failure = self._failure or LinkError("the bridge has ended")
         with suppress(Exception):
             if free:
-                if self._board_homed:
+                while self._homing_stops:
                     self._stop_board_homing()
                 self._slow_down()
         for _ in range(STOPS):

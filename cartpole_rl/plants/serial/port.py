@@ -117,7 +117,7 @@ def port_of(earlier: UsbPort, port: str) -> str:
     """
     ports = found_ports()
     paths = [each.device for each in ports if each.identity == earlier.identity]
-    if any(is_name_of(port, path) for path in paths):
+    if len(paths) == 1 and is_name_of(port, paths[0]):
         return port  # a link follows its cart
     if earlier.device in paths:
         return earlier.device

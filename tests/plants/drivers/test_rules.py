@@ -300,7 +300,7 @@ def test_a_board_that_homes_may_set_its_count() -> None:
 
 
 def test_a_board_whose_homing_is_broken_off_is_stopped_before_it_is_slowed_down() -> None:
-    """While it homes it may take no commands."""
+    """While it homes it may take no commands, and one line may be damaged."""
     bridge = Playing(homing="board", sends="acceleration", full=12.0)
     bridge._stand_in.board_homes = True
     bridge.measure(*range(0, -4000, -40))
@@ -308,8 +308,10 @@ def test_a_board_whose_homing_is_broken_off_is_stopped_before_it_is_slowed_down(
     bridge._stand_in.board_homes = False
     bridge._command()
     assert (bridge.played.stops, bridge.played.sent) == (stops + 1, sent)
-    bridge.measure(-4040, -4080)
-    assert bridge.played.stops == stops + 1
+    bridge.measure(-4040)
+    assert (bridge.played.stops, bridge.played.sent) == (stops + 2, sent)
+    bridge.measure(-4080, -4120)
+    assert bridge.played.stops == stops + 2
     assert bridge.played.sent[-1] > 0  # it still runs to the left
 
 
