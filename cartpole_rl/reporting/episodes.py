@@ -41,6 +41,7 @@ def report_episodes(
     plant: str,
     pole: PoleSettings,
     task: TaskSettings,
+    track_half_length: float,
     link: Mapping[str, int] | None = None,
     history: Sequence[Mapping[str, float]] = (),
     onboard: Sequence[Episode] = (),
@@ -50,24 +51,25 @@ def report_episodes(
 
     metrics.json is written last: a run that has it is complete. If a figure cannot be written, it is written
     all the same, and OSError is raised.
+    `track_half_length`, m, is that of carts that do not tell theirs.
     Behaviour figure and animation show the first episode; `mp4` adds the animation as an MP4. `history` adds
     the learning curve, `onboard` the episodes that the cart's board drove, under that key of metrics.json and
     of the summary.
     """
-    x_max = task.x_max
-    summary, listed = summarized(episodes, x_max)
+    track = track_half_length
+    summary, listed = summarized(episodes, track)
     header = {"plant": plant, "pole": pole.name, **(link or {})}
     cart, origins = stored_origins(episodes)
     listed = [{**each, **origin} for each, origin in zip(listed, origins, strict=True)]
     content = {**header, **summary, **cart, "episodes": listed}
     figures, failed = folder / FIGURES, None
     if onboard:
-        summary["onboard"], listed = summarized(onboard, x_max)
+        summary["onboard"], listed = summarized(onboard, track)
         content["onboard"] = {**summary["onboard"], "episodes": listed}
     try:
         if onboard:
-            draw(onboard[0], figures, "onboard_", f"plant={plant}, on the board", pole, x_max, mp4)
-        draw(episodes[0], figures, "", f"plant={plant}", pole, x_max, mp4)
+            draw(onboard[0], figures, "onboard_", f"plant={plant}, on the board", pole, track, mp4)
+        draw(episodes[0], figures, "", f"plant={plant}", pole, track, mp4)
         if history:
             style.save(learning_curve(history, task.measure), figures / "learning_curve.png")
     except OSError as error:  # such as a full disk: the numbers are few, and need less room
@@ -78,18 +80,18 @@ def report_episodes(
     return summary
 
 
-def summarized(episodes: Sequence[Episode], x_max: float) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """Return the summary of episodes, and the metrics of each."""
-    metrics = [episode_metrics(episode, x_max) for episode in episodes]
+def summarized(episodes: Sequence[Episode], track: float) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Return the summary of episodes, and the metrics of each; `track` is half its length, m."""
+    metrics = [episode_metrics(episode, track) for episode in episodes]
     return summarize(metrics), metrics
 
 
 def draw(
-    episode: Episode, folder: Path, prefix: str, title: str, pole: PoleSettings, x_max: float, mp4: bool
+    episode: Episode, folder: Path, prefix: str, title: str, pole: PoleSettings, track: float, mp4: bool
 ) -> None:
     """Write the behaviour figure and the animation of the first episode."""
-    style.save(behaviour(episode, f"First episode, {title}", x_max), folder / f"{prefix}behaviour.png")
-    pictures = [*frames(episode, pole.nominal.length, x_max, title)]
+    style.save(behaviour(episode, f"First episode, {title}", track), folder / f"{prefix}behaviour.png")
+    pictures = [*frames(episode, pole.nominal.length, track, title)]
     write_animation(folder / f"{prefix}{ANIMATION}", pictures, durations(episode), mp4)
 
 

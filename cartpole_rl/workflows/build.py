@@ -32,6 +32,7 @@ from cartpole_rl.rig.parameters import check_names, completed
 from cartpole_rl.run_folder import (
     BASELINE,
     CHECKPOINTS,
+    START,
     find_agent,
     is_own_policy,
     program_of,
@@ -214,7 +215,8 @@ def recorded_cart(recordings: Sequence[Path]) -> CartPoleSettings | None:
     """
     folder = recordings[0].parent.parent
     if program_of(folder) == "finetune":
-        training = trained_agent(folder).training
+        start = folder / CHECKPOINTS / START  # while it is not finished
+        training = trained_agent(start if start.exists() else folder).training
         return CartPoleSettings(**{name: getattr(training, name) for name in CartPoleSettings.model_fields})
     recorded = recorded_config(folder).get(RECORDED)
     if not recorded or program_of(folder) not in ("record", "import"):

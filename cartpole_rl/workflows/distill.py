@@ -67,7 +67,8 @@ def distill(config: DistillConfig, folder: Path) -> float:
     if tuned_poles:
         print_message("distill", "note: the teacher was fine-tuned on a pole that the student did not see")
     save_agent(folder / CHECKPOINTS / LAST, agent)
-    report_episodes(folder, episodes, training.plant.kind, training.pole, training.task)
+    track = training.nominal_cart["track_half_length"]
+    report_episodes(folder, episodes, training.plant.kind, training.pole, training.task, track)
     print(f"a network of {list(config.hidden)} hidden units scores {score:z.0f}")
     files = f"{METRICS}, {FIGURES}/ and {CHECKPOINTS}/"
     print_results(folder, files, f"cartpole-export {as_word('run', shown(folder))} format=c")

@@ -28,7 +28,16 @@ from cartpole_rl.randomization.poles import Pole, PoleSettings
 from cartpole_rl.reporting.texts import guard_text
 from cartpole_rl.reporting.web_view import chosen_view
 from cartpole_rl.rig.hardware import hardware_of
-from cartpole_rl.run_folder import BASELINE, METRICS, check_program, is_own_policy, recorded_config
+from cartpole_rl.run_folder import (
+    AGENT_HASH,
+    BASELINE,
+    METRICS,
+    check_program,
+    file_hash,
+    is_own_policy,
+    recorded_config,
+    recorded_provenance,
+)
 from cartpole_rl.tasks.episode import Episode, Origin
 from cartpole_rl.terminal import confirm, print_message, progress_bar, waiting
 from cartpole_rl.workflows.build import (
@@ -250,7 +259,7 @@ def repetition(config: EvaluateConfig) -> Repetition | None:
     if config.run != BASELINE and not is_own_policy(config.run):
         check_same_cart(config, recorded["evaluated"])
     batch_number = (recorded.get("repeat") or {}).get("episode")
-    evaluation = same_evaluation(config, recorded, origin)
+    evaluation = same_evaluation(config, run, recorded, origin)
     row = (number if batch_number is None else batch_number) % simulated_carts(evaluation)
     return Repetition(evaluation, origin, row, metrics["episodes"][number]["score"])
 
@@ -285,10 +294,13 @@ def read_evaluation(run: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     return recorded, metrics
 
 
-def same_evaluation(config: EvaluateConfig, recorded: Mapping[str, Any], origin: Origin) -> EvaluateConfig:
-    """Return the recorded evaluation with the agent of `config`, on that cart only. Raises ConfigError.
+def same_evaluation(
+    config: EvaluateConfig, run: Path, recorded: Mapping[str, Any], origin: Origin
+) -> EvaluateConfig:
+    """Return the evaluation that was recorded in `run` with the agent of `config`, on that cart only.
 
     The guard is the one of then if it was chosen, or if the agent is the same; else it is the agent's own.
+    Raises ConfigError.
     """
     former = {name: recorded[name] for name in EvaluateConfig.model_fields if name in recorded}
     own = {name: getattr(config, name) for name in ("run", "label", "repeat", "animation", "view")}
@@ -300,6 +312,11 @@ def same_evaluation(config: EvaluateConfig, recorded: Mapping[str, Any], origin:
         "randomization": {},
     }
     same_agent = Path(former["run"]).resolve() == config.run.resolve()
+    used = recorded_provenance(run).get(AGENT_HASH)
+    if used and (file := agent_file(config.run)):
+        same_agent = file_hash(file) == used
+    if same_agent and config.run == BASELINE:  # it is designed for the chosen pole, whatever the cart has
+        one_cart |= {"parameters": origin.parameters, "pole": former.get("pole")}
     if former.get("guard") or same_agent:  # its numbers may be of all the poles then
         one_cart["guard"] = recorded["evaluated"]["guard"]
     return validated(EvaluateConfig, {**former, **own, **one_cart})

@@ -71,13 +71,16 @@ def report_evaluation(
     link = evaluation.env.plant.link_figures()
     mp4 = evaluation.config.animation.mp4
     heading = f"plant={plant}, {count_text(len(episodes))}"
-    summary, _ = summarized(episodes, settings.task.x_max)
+    track = settings.nominal_cart["track_half_length"]
+    summary, _ = summarized(episodes, track)
     try:
-        report_episodes(folder, episodes, plant, settings.pole, settings.task, link, onboard=onboard, mp4=mp4)
+        report_episodes(
+            folder, episodes, plant, settings.pole, settings.task, track, link, onboard=onboard, mp4=mp4
+        )
     finally:  # figures can fail, and so can printing, which then hides no other error
         with unless_closed():
             if onboard:
-                by_board, _ = summarized(onboard, settings.task.x_max)
+                by_board, _ = summarized(onboard, track)
                 print(score_columns({"this computer": summary, "on the board": by_board}, heading))
                 print(same_motors(onboard))
             else:

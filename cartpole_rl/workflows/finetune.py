@@ -330,9 +330,9 @@ def compare(cart: FinetuningCart, tuned: TunedAgent, settings: CartPoleSettings)
     """Keep the better policy; write both policies and the results, and print the results."""
     files, config, task = cart.files, cart.config, settings.task
     episodes = {stage: files.episodes(stage) for stage in Stage}
-    summaries = {}
+    summaries, track = {}, settings.nominal_cart["track_half_length"]
     for stage in (Stage.BEFORE, Stage.AFTER):
-        summary, listed = summarized(episodes[stage], task.x_max)
+        summary, listed = summarized(episodes[stage], track)
         summaries[stage] = {**summary, "episodes": listed}
     scores = {stage: each[task.measure]["mean"] for stage, each in summaries.items()}
     kept = Stage.AFTER if scores[Stage.AFTER] >= scores[Stage.BEFORE] else Stage.BEFORE
@@ -341,7 +341,7 @@ def compare(cart: FinetuningCart, tuned: TunedAgent, settings: CartPoleSettings)
     names = {other: f"{other}.pt", kept: LAST}
     for stage, name in names.items():
         save_agent(folder / CHECKPOINTS / name, tuned.checkpoint(stage, scores[stage], settings.pole))
-    report_episodes(folder, episodes[kept], config.plant.kind, settings.pole, task, link)
+    report_episodes(folder, episodes[kept], config.plant.kind, settings.pole, task, track, link)
     write_json(folder / COMPARISON, {**summaries, "kept": kept})
     for stage, summary in summaries.items():
         print(score_table(summary, f"{stage}, {count_text(len(episodes[stage]))}"))

@@ -31,7 +31,7 @@ from cartpole_rl.reporting.web_view import WebView
 from cartpole_rl.rig.hardware import nominal_hardware
 from cartpole_rl.rig.parameters import check_names, check_values
 from cartpole_rl.run_folder import FIGURES, recordings, write_config, write_json
-from cartpole_rl.terminal import as_word, print_results, shown, words_given
+from cartpole_rl.terminal import as_word, print_message, print_results, shown, words_given
 from cartpole_rl.workflows.build import recorded_cart
 from cartpole_rl.workflows.checks import note_other_numbers
 from cartpole_rl.workflows.config import ReplayConfig, TrainConfig, load_settings
@@ -51,7 +51,8 @@ def replay_recordings(config: ReplayConfig, folder: Path) -> None:
     paths = recordings(config.source)
     loaded = [read_recording(path) for path in paths]
     episodes = [each.episode for each in loaded]
-    settings = recorded_cart(paths) or load_settings(TrainConfig)
+    known = recorded_cart(paths)
+    settings = known or load_settings(TrainConfig)
     given = {name: value for name in GROUPS if (value := getattr(config, name)) is not None}
     settings = settings.model_copy(update=given)
     by_file = {str(path): each for path, each in zip(paths, episodes, strict=True)}
@@ -61,6 +62,9 @@ def replay_recordings(config: ReplayConfig, folder: Path) -> None:
     check_names(parameters, "parameters")
     check_values(parameters)
     cart = {name: value for name, value in parameters.items() if name not in Pole.model_fields}
+    if known is None and config.cart is None:
+        line = "note: without the config.yaml of their run the recordings tell no cart: this is cart=ip02"
+        print_message("replay", line)
     note_other_numbers("replay", cart, [Pole(**{name: parameters[name] for name in Pole.model_fields})])
     period, plant = shared_period(by_file), config.plant
     models = settings.models(plant, config.actuator)

@@ -92,7 +92,7 @@ def train(config: TrainConfig, folder: Path) -> float | None:
             else:
                 monitor.randomization(env.plant)
             training.run()
-            drawn = config.plant.kind, config.pole, config.task
+            drawn = config.plant.kind, config.pole, config.task, config.nominal_cart["track_half_length"]
             metrics = report_episodes(folder, evaluate(), *drawn, history=monitor.history)
             monitor.finished(metrics)
         forget_training(folder)

@@ -1,7 +1,11 @@
 """Repeated episodes: same cart, same start, same score. Predicted ones: nominal cart, start of the cart."""
 
+import errno
+import io
 import json
-from contextlib import closing
+import shutil
+from collections.abc import Iterator
+from contextlib import closing, redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +19,12 @@ from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.evaluation.recordings import as_stored, read_origin, read_recording
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.emulated import EmulatedCart
+from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows import checks
 from cartpole_rl.workflows.build import predicting_env
 from cartpole_rl.workflows.config import EvaluateConfig, load_settings
-from cartpole_rl.workflows.episodes import prepared
+from cartpole_rl.workflows.episodes import Evaluation, prepared
+from cartpole_rl.workflows.evaluate import evaluate as evaluate_agent
 from cartpole_rl.workflows.evaluate import next_command, predicted_episode
 
 SAME = ("score", "score_upright", "reward", "steps", "ended_by", "min_track_margin_m", "rms_motor_change")
@@ -26,6 +32,10 @@ SAME = ("score", "score_upright", "reward", "steps", "ended_by", "min_track_marg
 
 def read(run: Path) -> dict[str, Any]:
     return json.loads((run / "metrics.json").read_text())
+
+
+def guard_of(run: Path) -> dict[str, Any]:
+    return yaml.safe_load((run / "config.yaml").read_text())["evaluated"]["guard"]
 
 
 @pytest.fixture(scope="module")
@@ -55,18 +65,49 @@ def repeat(trained: Path, folder: Path, run: str, number: int, *words: str):
 
 
 def test_the_same_cart_from_the_same_start_scores_the_same(trained: Path, evaluated: Path) -> None:
-    """Also where a repetition is repeated."""
-    then = read(evaluated / "wide")
+    """Also where a repetition is repeated, and where the agent has moved."""
+    then, agent = read(evaluated / "wide"), trained
     for run, number, folder in (("wide", 6, "again_wide_6"), ("again_wide_6", 0, "again_again_wide_6_0")):
-        done = repeat(trained, evaluated, run, number)
+        done = repeat(agent, evaluated, run, number)
+        agent = shutil.copytree(trained, evaluated / "moved", dirs_exist_ok=True)
         assert done.code == 0, done.err
         now = read(evaluated / folder)
         assert len(now["episodes"]) == 1
         for key in SAME:
             assert now["episodes"][0][key] == then["episodes"][6][key], key
         assert read_origin(now, 0) == read_origin(then, 6)
+        assert guard_of(evaluated / folder) == guard_of(evaluated / "wide")
         assert f"episode {number} of {run} had score" in done.out
         assert "now exactly the same" in done.out
+
+
+def test_the_baseline_of_another_pole_is_that_of_then(tmp_path: Path) -> None:
+    """It is designed for the chosen pole."""
+    other = ("parameters={pole_mass:0.35,pole_com:0.12}", "task=swingup", "task.time_limit=60", "episodes=2")
+    with no_pictures():
+        done = in_process("evaluate", "run=lqr", *other, "hydra.run.dir=other", folder=tmp_path)
+    assert done.code == 0, done.err
+    done = repeat(Path("lqr"), tmp_path, "other", 1)
+    assert "now exactly the same" in done.out, done.err
+
+
+class ClosedTerminal(io.StringIO):
+    def write(self, text: str) -> int:
+        raise OSError(errno.EIO, "Input/output error")
+
+
+def test_results_outlive_the_terminal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    episodes = Evaluation.episodes
+
+    def interrupted(evaluation: Evaluation) -> Iterator[Episode]:
+        yield next(episodes(evaluation))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Evaluation, "episodes", interrupted)
+    given = {"run": "lqr", "task": "swingup", "task.time_limit": 30}
+    with no_pictures(), redirect_stdout(ClosedTerminal()), pytest.raises(KeyboardInterrupt):
+        evaluate_agent(load_settings(EvaluateConfig, given), tmp_path / "run")
+    assert len(read(tmp_path / "run")["episodes"]) == 1
 
 
 def test_the_carts_of_an_evaluation_differ_and_are_told_whole(evaluated: Path) -> None:

@@ -1,6 +1,7 @@
 """cartpole-export writes the files of each format, and says which; cartpole-import takes recordings back."""
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -8,6 +9,7 @@ import torch
 from command_line import in_process
 
 from cartpole_rl.exporting.agent import read_agent
+from cartpole_rl.run_folder import find_pretrained
 from cartpole_rl.workflows.build import recorded_cart
 
 FILES = {
@@ -77,6 +79,15 @@ def test_recordings_come_back_to_the_bit(form: str, recorded: Path) -> None:
     assert [path.name for path in after] == ["episode_000.csv", "episode_001.csv"]
     assert [path.read_bytes() for path in after] == [path.read_bytes() for path in before]
     assert recorded_cart(after) == recorded_cart(before) is not None
+
+
+def test_the_cart_of_an_unfinished_fine_tuning_is_that_of_its_first_agent(tmp_path: Path) -> None:
+    (tmp_path / "checkpoints").mkdir()
+    shutil.copy(find_pretrained(Path("pretrained/medium")), tmp_path / "checkpoints/start.pt")
+    (tmp_path / "provenance.json").write_text('{"program": "cartpole-finetune"}')
+    cart = recorded_cart([tmp_path / "recordings/episode_000.csv"])
+    assert cart is not None
+    assert cart.pole.name == "medium"
 
 
 def test_a_data_set_is_found_by_its_name(recorded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
