@@ -62,9 +62,6 @@ def replay_recordings(config: ReplayConfig, folder: Path) -> None:
     check_names(parameters, "parameters")
     check_values(parameters)
     cart = {name: value for name, value in parameters.items() if name not in Pole.model_fields}
-    if known is None and config.cart is None:
-        line = "note: without the config.yaml of their run the recordings tell no cart: this is cart=ip02"
-        print_message("replay", line)
     note_other_numbers("replay", cart, [Pole(**{name: parameters[name] for name in Pole.model_fields})])
     period, plant = shared_period(by_file), config.plant
     models = settings.models(plant, config.actuator)
@@ -85,6 +82,9 @@ def replay_recordings(config: ReplayConfig, folder: Path) -> None:
     count = count_text(len(episodes))
     subtitle = f"above: {paths[0].name},  below: {count},  pole={name}"
     save(replay_figure(replays, period, REPORTED_TIMES, "Measured and simulated", subtitle), folder / FIGURE)
+    if known is None and config.cart is None:
+        line = "note: without the config.yaml of their run the recordings tell no cart: this is cart=ip02"
+        print_message("replay", line)
     print(error_table({"": errors}, f"errors of {count}, pole={name}, over the time since a reset"))
     if away:
         print(error_table({"": away}, "the same away from upright; near it an error grows e times in 0.15 s"))

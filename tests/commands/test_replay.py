@@ -1,6 +1,7 @@
 """A replay of the recorded cart follows it; that of another cart does not, and its errors are reported."""
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +53,12 @@ def test_another_cart_is_not_followed(recorded: Path, tmp_path: Path) -> None:
     assert len(results["recordings"]) == 1
     assert results["parameters"]["cart_coulomb"] == 0.8
     assert results["errors"][0]["rms_x_mm"] > 0.3
+
+
+def test_copied_recordings_tell_no_cart(recorded: Path, tmp_path: Path) -> None:
+    shutil.copy(recorded / "recordings/episode_000.csv", tmp_path)
+    done, _ = replay(tmp_path / "episode_000.csv", tmp_path)
+    assert "tell no cart: this is cart=ip02" in done.err
 
 
 def test_the_cart_of_the_recorded_agent_is_followed(tmp_path: Path) -> None:
