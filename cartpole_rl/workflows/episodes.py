@@ -259,7 +259,7 @@ def repetition(config: EvaluateConfig) -> Repetition | None:
     if config.run != BASELINE and not is_own_policy(config.run):
         check_same_cart(config, recorded["evaluated"])
     batch_number = (recorded.get("repeat") or {}).get("episode")
-    evaluation = same_evaluation(config, run, recorded, origin)
+    evaluation = same_evaluation(config, recorded, origin)
     row = (number if batch_number is None else batch_number) % simulated_carts(evaluation)
     return Repetition(evaluation, origin, row, metrics["episodes"][number]["score"])
 
@@ -294,13 +294,10 @@ def read_evaluation(run: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     return recorded, metrics
 
 
-def same_evaluation(
-    config: EvaluateConfig, run: Path, recorded: Mapping[str, Any], origin: Origin
-) -> EvaluateConfig:
-    """Return the evaluation that was recorded in `run` with the agent of `config`, on that cart only.
+def same_evaluation(config: EvaluateConfig, recorded: Mapping[str, Any], origin: Origin) -> EvaluateConfig:
+    """Return the recorded evaluation with the agent of `config`, on that cart only. Raises ConfigError.
 
     The guard is the one of then if it was chosen, or if the agent is the same; else it is the agent's own.
-    Raises ConfigError.
     """
     former = {name: recorded[name] for name in EvaluateConfig.model_fields if name in recorded}
     own = {name: getattr(config, name) for name in ("run", "label", "repeat", "animation", "view")}
@@ -312,7 +309,7 @@ def same_evaluation(
         "randomization": {},
     }
     same_agent = Path(former["run"]).resolve() == config.run.resolve()
-    used = recorded_provenance(run).get(AGENT_HASH)
+    used = recorded_provenance(config.repeat.run or Path()).get(AGENT_HASH)
     if used and (file := agent_file(config.run)):
         same_agent = file_hash(file) == used
     if same_agent and config.run == BASELINE:  # it is designed for the chosen pole, whatever the cart has

@@ -30,7 +30,7 @@ from cartpole_rl.reporting.texts import count_text
 from cartpole_rl.reporting.web_view import WebView
 from cartpole_rl.rig.hardware import nominal_hardware
 from cartpole_rl.rig.parameters import check_names, check_values
-from cartpole_rl.run_folder import FIGURES, recordings, write_config, write_json
+from cartpole_rl.run_folder import FIGURES, program_of, recordings, write_config, write_json
 from cartpole_rl.terminal import as_word, print_message, print_results, shown, words_given
 from cartpole_rl.workflows.build import recorded_cart
 from cartpole_rl.workflows.checks import note_other_numbers
@@ -51,8 +51,7 @@ def replay_recordings(config: ReplayConfig, folder: Path) -> None:
     paths = recordings(config.source)
     loaded = [read_recording(path) for path in paths]
     episodes = [each.episode for each in loaded]
-    known = recorded_cart(paths)
-    settings = known or load_settings(TrainConfig)
+    settings = recorded_cart(paths) or load_settings(TrainConfig)
     given = {name: value for name in GROUPS if (value := getattr(config, name)) is not None}
     settings = settings.model_copy(update=given)
     by_file = {str(path): each for path, each in zip(paths, episodes, strict=True)}
@@ -82,7 +81,7 @@ def replay_recordings(config: ReplayConfig, folder: Path) -> None:
     count = count_text(len(episodes))
     subtitle = f"above: {paths[0].name},  below: {count},  pole={name}"
     save(replay_figure(replays, period, REPORTED_TIMES, "Measured and simulated", subtitle), folder / FIGURE)
-    if known is None and config.cart is None:
+    if program_of(paths[0].parent.parent) is None and config.cart is None:
         line = "note: without the config.yaml of their run the recordings tell no cart: this is cart=ip02"
         print_message("replay", line)
     print(error_table({"": errors}, f"errors of {count}, pole={name}, over the time since a reset"))
