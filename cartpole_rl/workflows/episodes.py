@@ -276,10 +276,13 @@ def check_same_cart(config: EvaluateConfig, evaluated: Mapping[str, Any]) -> Non
 
 
 def read_evaluation(run: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the config and the metrics of an evaluation in simulation. Raises ConfigError."""
+    """Return the config, with the hash of the agent, and the metrics of an evaluation in simulation.
+
+    Raises ConfigError.
+    """
     check_program("repeat.run", run, "evaluate")
     try:
-        recorded = recorded_config(run)
+        recorded = {**recorded_config(run), AGENT_HASH: recorded_provenance(run).get(AGENT_HASH)}
         metrics = json.loads((run / METRICS).read_text(encoding="utf-8"))
         plant, _ = metrics["plant"], recorded["evaluated"]
     except (OSError, ValueError, LookupError, TypeError):
@@ -309,8 +312,7 @@ def same_evaluation(config: EvaluateConfig, recorded: Mapping[str, Any], origin:
         "randomization": {},
     }
     same_agent = Path(former["run"]).resolve() == config.run.resolve()
-    used = recorded_provenance(config.repeat.run or Path()).get(AGENT_HASH)
-    if used and (file := agent_file(config.run)):
+    if (used := recorded.get(AGENT_HASH)) and (file := agent_file(config.run)):
         same_agent = file_hash(file) == used
     if same_agent and config.run == BASELINE:  # it is designed for the chosen pole, whatever the cart has
         one_cart |= {"parameters": origin.parameters, "pole": former.get("pole")}

@@ -133,7 +133,7 @@ def port_of(earlier: UsbPort, port: str) -> str:
 
 
 def is_name_of(port: str, device: str) -> bool:
-    """Return True if `port` is `device`, a link to it, or its other name on macOS or in Windows's letters."""
+    """Return True if `port` names `device`: itself, a link, tty.* on macOS, another case on Windows."""
     if os.name == "nt":
         return port.lower() == device.lower()
     return os.path.realpath(port).replace("/dev/tty.", "/dev/cu.") == device
