@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
-from cartpole_rl.evaluation.episodes import run_episodes
+from cartpole_rl.evaluation.episodes import Knocks, run_episodes
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.tasks.settings import Start, StartSettings
 
@@ -137,3 +137,22 @@ def test_the_same_seed_gives_the_same_episodes(simulated: Callable) -> None:
         runs.append(np.concatenate([episode.theta for episode in run_episodes(env, always(RIGHT), 8)]))
     assert np.array_equal(runs[0], runs[1])
     assert not np.array_equal(runs[0], runs[2])
+
+
+def test_a_pole_that_stood_for_two_seconds_is_knocked_once_to_either_side_in_turn(
+    simulated: Callable,
+) -> None:
+    env = simulated(2, {"start": scattered(Start.UPRIGHT)}, time_limit=110)  # exactly upright, it stays there
+    left_alone = list(run_episodes(env, always(NONE), 2))
+    knocked = list(run_episodes(env, always(NONE), 4, Knocks(env.plant, 3.0)))
+    assert all(np.abs(each.theta).max() == 0 for each in left_alone)
+    for episode, sign in zip(knocked, (1, -1, 1, -1), strict=True):
+        assert np.abs(episode.theta[:100]).max() == 0  # rad
+        moved = sign * (episode.theta[101] - episode.theta[100])
+        assert moved == pytest.approx(3.0 * 0.02, rel=0.1)
+
+
+def test_a_hanging_pole_is_not_knocked(simulated: Callable) -> None:
+    env = simulated(time_limit=150)
+    (episode,) = run_episodes(env, always(NONE), 1, Knocks(env.plant, 3.0))
+    assert np.ptp(episode.theta) == 0
