@@ -21,7 +21,6 @@ from torchrl.modules import QValueActor
 
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv, OneCart
 from cartpole_rl.envs.perception import Percept
-from cartpole_rl.envs.settings import ObservationSettings
 from cartpole_rl.errors import FaultError
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy
 from cartpole_rl.plants.measured import measured_part
@@ -322,26 +321,19 @@ def run_onboard(env: CartPoleEnv, policy: Policy) -> Episode:
     expected = np.array([cart.guarded_motor(*pair) for pair in zip(actions, percepts, strict=True)])
     ending = ending_of(env, 0, steps[-1].truncated[0], steps[-1].state[2])
     episode = one_episode(env, first, steps, frames, np.array(motors), expected != chosen, ending)
-    gaps = np.array(stopped) | late(frames, plant.cart.information.period_us * 1e-6)
-    compared = comparable(gaps[1:], memory(env.hardware.observation_settings), ending)
+    longest = LATE_PERIODS * plant.cart.information.period_us * 1e-6  # s; longer: states were missed
+    gaps = np.array(stopped) | (np.array([frame.dt[0] for frame in frames]) > longest)
+    observed = env.hardware.observation_settings
+    memory = max(observed.past_motors, observed.past_velocities, observed.past_positions)
+    compared = comparable(gaps[1:], memory, ending)
     return replace(episode, expected=expected[: episode.steps], compared=compared[: episode.steps])
-
-
-def late(frames: Sequence[PlantOutput[Numbers]], period: float) -> NDArray[np.bool_]:
-    """Return [T+1] which frames came more than 1.5 periods after the one before: states were missed."""
-    return np.array([frame.dt[0] for frame in frames]) > LATE_PERIODS * period
-
-
-def memory(observation: ObservationSettings) -> int:
-    """Return how many past periods an agent observes."""
-    return max(observation.past_motors, observation.past_velocities, observation.past_positions)
 
 
 def comparable(gaps: NDArray[np.bool_], memory: int, ending: str) -> NDArray[np.bool_]:
     """Return [T] in which periods board and computer chose from the same observation.
 
     `gaps` [T]: before the state at the end of the period, a state was missed, or the watchdog or a limit
-    held the motor.
+    held the motor. `memory` is the number of past periods that the agent observes.
     The board then observes other velocities, for `memory` periods more another past. The last state before an
     ending that stops the motor does not report the policy's value.
     """

@@ -89,14 +89,10 @@ def draw(memory: Memory, title: str, colour: bool) -> NoReturn:
         columns, rows = terminal = terminal_size()
         if size != terminal:
             size = columns, rows
-            put(reserved(rows))
+            below = LINES + 1  # what is printed there scrolls; the cursor goes there
+            put(f"\x1b[{below};{max(rows, below + 1)}r\x1b[{below};1H")
         put(picture(view(title, snapshot, time.monotonic() - changed < FRESH, columns - 1, colour)))
         time.sleep(INTERVAL)
-
-
-def reserved(rows: int) -> str:
-    """Return what keeps the top lines of a terminal from scrolling; the cursor goes below them."""
-    return f"\x1b[{LINES + 1};{max(rows, LINES + 2)}r\x1b[{LINES + 1};1H"
 
 
 def picture(lines: list[str]) -> str:
@@ -119,11 +115,8 @@ def view(title: str, snapshot: Snapshot | None, fresh: bool, width: int, colour:
         return [line[:width] for line in [*waiting, *[""] * (LINES - 3), rule]]
     state = f"step {snapshot.step}" if fresh else f"ended at step {snapshot.step}"
     heading = f"{title}: episode {snapshot.episode}, {state}"
-    return [
-        heading[:width],
-        *(painted(line[:width], tint, colour) for line, tint in gauges(snapshot, width)),
-        rule,
-    ]
+    shown = [(line[:width], tint if colour else "") for line, tint in gauges(snapshot, width)]
+    return [heading[:width], *(f"{tint}{line}{PLAIN}" if tint else line for line, tint in shown), rule]
 
 
 def gauges(snapshot: Snapshot, width: int) -> list[tuple[str, str]]:
@@ -153,8 +146,3 @@ def gauge(label: str, share: float, value: str, width: int) -> str:
     cells[half] = "."
     cells[half + round(max(-1.0, min(1.0, share)) * half)] = "#"
     return f"{label:<{LABEL}}[{''.join(cells)}]{value}"
-
-
-def painted(line: str, tint: str, colour: bool) -> str:
-    """Return a line in a colour, if colours are used."""
-    return f"{tint}{line}{PLAIN}" if tint and colour else line

@@ -23,7 +23,7 @@ from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 from cartpole_rl.drawing import filled, shared_parts
 from cartpole_rl.errors import ConfigError
@@ -81,7 +81,8 @@ class WebView:
         ignored = signal.getsignal(signal.SIGINT) == signal.SIG_IGN  # as a shell's & leaves it
         answer = STOPPED if self.memory else TRAINING_STOPPED if grows else CLOSED
         stop = Stop(os.getpid(), signal.SIGTERM if ignored else signal.SIGINT, self._stopped, answer)
-        arguments = (self._listener, self._secret, shown, [*(episodes or ())], receiver, self.memory, stop)
+        site = Site(self._secret, shown, [*map(json.dumps, episodes or ())], self.memory, stop)
+        arguments = self._listener, site, receiver
         self._process = context.Process(target=serve, args=arguments, daemon=True)
 
     @property
@@ -139,52 +140,14 @@ class Stop:
             os.kill(self.process, self._number)
 
 
-def serve(
-    listener: socket.socket,
-    secret: str,
-    shown: str,
-    episodes: list[dict[str, Any]],
-    added: Connection,
-    memory: Memory | None,
-    stop: Stop,
-) -> None:
-    """Answer requests until the process is ended or its parent ends."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
-    end_with_parent(stop.process)
-    lose_precedence(LESS_URGENT)
-    recording = [*map(json.dumps, episodes)]
+class Site(NamedTuple):
+    """The page `shown` under the path /`secret`/, and what it asks for: the cart, or a recording."""
 
-    def receive() -> None:
-        with suppress(EOFError, OSError):
-            while True:
-                recording.append(json.dumps(added.recv()))
-
-    threading.Thread(target=receive, daemon=True).start()
-    Server(listener, secret, shown, recording, memory, stop).serve_forever()
-
-
-class Server(ThreadingHTTPServer):
-    """Answers below the path /`secret`/ with the page `shown`, the newest snapshot, or episodes as JSON.
-
-    `recording` has a text for each episode; a process that serves a training appends them.
-    """
-
-    daemon_threads = True
-
-    def __init__(
-        self,
-        listener: socket.socket,
-        secret: str,
-        shown: str,
-        recording: list[str],
-        memory: Memory | None,
-        stop: Stop,
-    ) -> None:
-        super().__init__(listener.getsockname(), Handler, bind_and_activate=False)
-        self.socket.close()
-        self.socket = listener
-        self.secret, self.shown, self.recording = secret, shown, recording
-        self.memory, self.stop = memory, stop
+    secret: str
+    shown: str
+    recording: list[str]  # each episode as JSON; a process that serves a training appends them
+    memory: Memory | None
+    stop: Stop
 
     def newest(self) -> str:
         """Return the newest snapshot and its number as JSON; null for a number that is not finite."""
@@ -193,6 +156,32 @@ class Server(ThreadingHTTPServer):
             name: value if math.isfinite(value) else None for name, value in snapshot._asdict().items()
         }
         return json.dumps({"number": number, "snapshot": shown})
+
+
+def serve(listener: socket.socket, site: Site, added: Connection) -> None:
+    """Answer requests until the process is ended or its parent ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
+    end_with_parent(site.stop.process)
+    lose_precedence(LESS_URGENT)
+
+    def receive() -> None:
+        with suppress(EOFError, OSError):
+            while True:
+                site.recording.append(json.dumps(added.recv()))
+
+    threading.Thread(target=receive, daemon=True).start()
+    Server(listener, site).serve_forever()
+
+
+class Server(ThreadingHTTPServer):
+    """Answers requests to a site at an open port."""
+
+    daemon_threads = True
+
+    def __init__(self, listener: socket.socket, site: Site) -> None:
+        super().__init__(listener.getsockname(), Handler, bind_and_activate=False)
+        self.socket.close()
+        self.socket, self.site = listener, site
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Do nothing: a browser that goes away is no error."""
@@ -210,11 +199,11 @@ class Handler(BaseHTTPRequestHandler):
         name = self.wanted()
         known = re.fullmatch(r"recording\?from=(\d{1,9})", name or "", re.ASCII)
         if name == "":
-            self.answer(200, self.server.shown, "text/html")
+            self.answer(200, self.server.site.shown, "text/html")
         elif name == "now":
-            self.answer(200, self.server.newest(), "application/json")
+            self.answer(200, self.server.site.newest(), "application/json")
         elif known:
-            episodes = self.server.recording[int(known[1]) :]
+            episodes = self.server.site.recording[int(known[1]) :]
             self.answer(200, f"[{','.join(episodes)}]", "application/json")
         elif name is not None:
             self.answer(404, "There is nothing here.")
@@ -231,11 +220,11 @@ class Handler(BaseHTTPRequestHandler):
         if name is not None and origin not in (None, f"http://{self.headers['Host']}"):
             self.answer(403, "Another page asked.")
         elif name == "stop":
-            text = f'<meta name="color-scheme" content="light dark">{self.server.stop.answer}'
+            text = f'<meta name="color-scheme" content="light dark">{self.server.site.stop.answer}'
             try:  # first: the parent ends this process
                 self.answer(200, text, "text/html")
             finally:
-                self.server.stop()
+                self.server.site.stop()
         elif name is not None:
             self.answer(404, "There is nothing here.")
 
@@ -244,7 +233,7 @@ class Handler(BaseHTTPRequestHandler):
         secret, _, name = self.path.removeprefix("/").partition("/")
         if self.headers.get("Host", "").partition(":")[0] not in HOSTS:
             self.answer(403, "This page is for its own computer alone.")
-        elif not hmac.compare_digest(secret.encode(), self.server.secret.encode()):
+        elif not hmac.compare_digest(secret.encode(), self.server.site.secret.encode()):
             self.answer(404, "There is nothing here.")
         else:
             return name

@@ -22,10 +22,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-import yaml
 from common import (
     LOST_SCORE,
     option_parser,
+    overrides_of,
     positive_int,
     print_table,
     processes,
@@ -208,8 +208,7 @@ def main() -> None:
     )
     parser.add_argument("--jobs", type=positive_int, default=1, help="trainings at the same time (1)")
     options, words = parser.parse_known_args()
-    pairs = (word.partition("=") for word in words)
-    overrides = {name: yaml.safe_load(value) for name, _, value in pairs}
+    overrides = overrides_of(words)
     known = read_json(options.json) if options.json and options.json.exists() else []
     results = {Job(each["wider"], each["seed"], each["informed"]): each for each in known}
     asked = [Job(w, s, i) for w in options.wider for s in range(options.seeds) for i in (False, True)]

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+import yaml
 
 from cartpole_rl.reporting.texts import Cell, table
 from cartpole_rl.workflows.build import use_threads
@@ -71,6 +72,11 @@ def add_wider_option(parser: argparse.ArgumentParser) -> None:
         metavar="SHARE",
         help="extend each range on both sides by this share of its width, from 0 (default) to 1",
     )
+
+
+def overrides_of(words: Iterable[str]) -> dict[str, Any]:
+    """Return the settings that words such as `learning.carts=16` give."""
+    return {name: yaml.safe_load(value) for name, _, value in (word.partition("=") for word in words)}
 
 
 def failure(command: str, *words: str) -> str | None:

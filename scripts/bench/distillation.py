@@ -15,8 +15,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import yaml
-from common import RUNS, option_parser, positive_int, print_table, processes, write_json
+from common import RUNS, option_parser, overrides_of, positive_int, print_table, processes, write_json
 from learning import judge
 
 from cartpole_rl.exporting.c_code import c_files
@@ -73,7 +72,7 @@ def main() -> None:
     options, words = parser.parse_known_args()
     runs = [Path(word) for word in options.runs if "=" not in word]
     words += [word for word in options.runs if "=" in word]
-    overrides = {key: yaml.safe_load(value) for key, _, value in (word.partition("=") for word in words)}
+    overrides = overrides_of(words)
     with processes(options.jobs) as pool:
         pending = [pool.submit(figures, run, options.pole) for run in runs]
         for hidden in options.hidden:

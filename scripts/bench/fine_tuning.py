@@ -22,12 +22,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from common import (
     LOST_SCORE,
     RUNS,
     add_wider_option,
     option_parser,
+    overrides_of,
     positive_int,
     print_table,
     processes,
@@ -167,8 +167,7 @@ def parse_options() -> tuple[argparse.Namespace, dict[str, Any]]:
     options, words = parser.parse_known_args()
     words += [word for word in options.agents if "=" in word]
     options.agents = [word for word in options.agents if word not in words]
-    pairs = (word.partition("=") for word in words)
-    return options, {name: yaml.safe_load(value) for name, _, value in pairs}
+    return options, overrides_of(words)
 
 
 def fine_tunings(

@@ -38,11 +38,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-import yaml
 from best_score.beam import held, landed, risk
 from best_score.cart import MOST, KnownCart, hanging, wrapped
 from best_score.swing_up import GENERATIONS, evolved, lacking, pushed
-from common import add_wider_option, option_parser, positive_int, processes, read_json, write_json
+from common import (
+    add_wider_option,
+    option_parser,
+    overrides_of,
+    positive_int,
+    processes,
+    read_json,
+    write_json,
+)
 from truth_references import Draw, add_reference, known_references
 from truths import REPORTED, Truth, simulated_cart
 
@@ -212,9 +219,7 @@ def search_truths(draw: Draw, count: int, states: int, jobs: int) -> None:
 
 def composed(overrides: Sequence[str]) -> TrainConfig:
     """Return the settings of cartpole-train with `overrides`, on the nominal cart. Raises ConfigError."""
-    pairs = (word.partition("=") for word in overrides)
-    values = {name: yaml.safe_load(value) for name, _, value in pairs}
-    return load_settings(TrainConfig, {**values, **ALONE})
+    return load_settings(TrainConfig, {**overrides_of(overrides), **ALONE})
 
 
 def with_rod(config: TrainConfig, length: float) -> TrainConfig:

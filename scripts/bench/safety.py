@@ -36,7 +36,6 @@ from typing import Any, Self
 
 from common import option_parser, positive_int, print_table, processes, write_json
 
-from cartpole_rl.checking import validated
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import CartPoleError, FrameError
 from cartpole_rl.evaluation.episodes import run_episodes
@@ -46,7 +45,7 @@ from cartpole_rl.reporting.texts import Cell
 from cartpole_rl.wire.frames import FrameSplitter, decode_frame
 from cartpole_rl.wire.messages import Home, Start, State
 from cartpole_rl.workflows.build import TrainedAgent, evaluated_env, evaluated_settings, trained_agent
-from cartpole_rl.workflows.config import EvaluateConfig
+from cartpole_rl.workflows.config import EvaluateConfig, load_settings
 
 AGENT = "pretrained/medium"
 FIRMWARES = ("python", "c")
@@ -235,18 +234,8 @@ def drive(case: Case, firmware: str, seed: int) -> dict[str, Any]:
 
 def episode_line(url: str) -> str:
     """Return the line with which an episode ends."""
-    settings = {
-        "run": AGENT,
-        "episodes": 1,
-        "plant": {"kind": "serial", "port": url},
-        "emulator": EmulatorSettings(),
-        "randomization": {},
-        "parameters": None,
-        "seed": 1,
-        "label": "",
-        "threads": 1,
-    }
-    config = validated(EvaluateConfig, settings)
+    given = {"run": AGENT, "episodes": 1, "plant": "serial", "plant.port": url, "seed": 1, "threads": 1}
+    config = load_settings(EvaluateConfig, given)
     try:
         with closing(evaluated_env(evaluated_settings(agent().training, config), config, print)) as env:
             (episode,) = run_episodes(env, agent().policy, 1)
@@ -345,8 +334,7 @@ def main() -> int:
             results.append(done.result())
             print(json.dumps(results[-1]), flush=True)
     results.sort(key=lambda each: (each["case"], each["firmware"], each["seed"]))
-    if options.json:
-        write_json(options.json, results)
+    write_json(options.json, results)
     print_table(summary(results))
     too_fast = [each for each in results if each["touched"] > LIMIT]
     print(f"{len(results)} episodes; a stop was touched faster than {LIMIT} m/s in {len(too_fast)}")

@@ -110,8 +110,7 @@ def main() -> None:
             rows.append({"command": name, **figures})
             print(rows[-1], flush=True)
     print_table(rows)
-    if options.json:
-        write_json(options.json, rows)
+    write_json(options.json, rows)
 
 
 if __name__ == "__main__":

@@ -42,14 +42,13 @@ from common import (
 from truth_references import Draw, known_references, note_missing
 from truths import COMPARED, REPORTED, Truth
 
-from cartpole_rl.checking import validated
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import PlantError
 from cartpole_rl.evaluation.episodes import Policy, run_episodes
 from cartpole_rl.reporting.texts import Cell
 from cartpole_rl.workflows.build import TrainedAgent, evaluated_env, evaluated_settings, trained_agent
-from cartpole_rl.workflows.config import EvaluateConfig
+from cartpole_rl.workflows.config import EvaluateConfig, load_settings
 
 Scores = list[float | None]  # of the episodes on one cart; None for one that was not driven
 DRAW = ("seed", "wider", "starts")  # the options that decide which episodes are driven
@@ -67,18 +66,9 @@ def agent_of(run: str) -> TrainedAgent:
 
 def drive(run: str, truth: Truth, starts: int) -> Scores:
     """Return the scores of the agent of `run` on a new emulated cart."""
-    settings = {
-        "run": run,
-        "episodes": starts,
-        "plant": {"kind": "emulated"},
-        "emulator": EmulatorSettings(**truth),
-        "randomization": {},
-        "parameters": None,
-        "seed": 1,
-        "label": "",
-        "threads": 1,
-    }
-    config, agent = validated(EvaluateConfig, settings), agent_of(run)
+    given = {"run": run, "episodes": starts, "plant": "emulated", "seed": 1, "threads": 1}
+    config, agent = load_settings(EvaluateConfig, given), agent_of(run)
+    config = config.model_copy(update={"emulator": EmulatorSettings(**truth)})
     with closing(evaluated_env(evaluated_settings(agent.training, config), config, print)) as env:
         return [episode_score(env, agent.policy, truth) for _ in range(starts)]
 

@@ -116,9 +116,6 @@ class RecordedPlant(OneCartPlant):
     def track_half_length(self) -> torch.Tensor:
         return torch.tensor([self.track_end])
 
-    def _set_seed(self, seed: int | None) -> None:
-        """Nothing is random."""
-
     def reset_one(self) -> PlantOutput[Numbers]:
         self.time_us = 0
         return self.step_one(0)

@@ -86,9 +86,6 @@ class ExactPlant(OneCartPlant):
     def track_half_length(self) -> torch.Tensor:
         return torch.tensor([self.track_end])
 
-    def _set_seed(self, seed: int | None) -> None:
-        """Nothing is random."""
-
     def reset_one(self) -> PlantOutput[Numbers]:
         self.motion, self.drive = self.start, (0.0,) * (1 + self.commands)
         x, _, theta, _ = self.start

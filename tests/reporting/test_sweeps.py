@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from cartpole_rl.errors import ConfigError
+from cartpole_rl.reporting.results import Results
 from cartpole_rl.reporting.runs_page import Gallery, comparison
 from cartpole_rl.reporting.sweeps import Sweep, grouped, read_groups, read_sweeps, results_of
 from cartpole_rl.reporting.tables import run_rows
@@ -25,14 +26,20 @@ def cells(page: str, column: str) -> list[str]:
     return re.findall(f'data-label="{re.escape(column)}">([^<]*)</td>', page)
 
 
-def read_sweep(name: str, sources: list[str], measure: str) -> Sweep:
+def read_sweep(*sources: str, name: str = "runs") -> Sweep:
     """The runs of one set."""
-    (sweep,) = read_sweeps({name: sources}, measure)
+    (sweep,) = read_sweeps({name: sources}, MEASURE)
     return replace(sweep, name=name)
 
 
+def results_in(*sources: str) -> Results:
+    """The results of one set of a single command."""
+    (sweep,), _ = read_groups({"runs": sources}, MEASURE)
+    return results_of(sweep, MEASURE)
+
+
 def test_runs_are_grouped_by_the_settings_that_differ(study: Path) -> None:
-    (sweep,), between = grouped([read_sweep("runs", ["quick/friction"], MEASURE)])
+    (sweep,), between = grouped([read_sweep("quick/friction")])
     results = results_of(sweep, MEASURE)
     assert between == {}
     assert [group.label for group in results.groups] == [
@@ -49,13 +56,11 @@ def test_runs_are_grouped_by_the_settings_that_differ(study: Path) -> None:
 
 
 def test_patterns_and_lists_name_runs(study: Path) -> None:
-    one = read_sweep("runs", ["quick/*/much/*/evaluations/heavy"], MEASURE)
-    two = read_sweep(
-        "runs", ["quick/friction/much/10", "quick/friction/much/11", "quick/friction/much/10"], MEASURE
-    )
+    one = read_sweep("quick/*/much/*/evaluations/heavy")
+    two = read_sweep("quick/friction/much/10", "quick/friction/much/11", "quick/friction/much/10")
     assert (len(one.members), len(two.members)) == (3, 4)
     with pytest.raises(ConfigError, match=r"compare=quick/none\*: there is no such folder"):
-        read_sweep("compare", ["quick/none*"], MEASURE)
+        read_sweep("quick/none*", name="compare")
 
 
 def test_runs_of_another_command_version_or_without_measure_are_named(study: Path, edit: Edit) -> None:
@@ -76,8 +81,7 @@ def test_runs_of_another_command_version_or_without_measure_are_named(study: Pat
 def test_a_seed_counts_once_and_unequal_seeds_are_noted(study: Path) -> None:
     shutil.copytree(study / "much/10/evaluations/heavy", "quick/zzz_again")
     shutil.rmtree(study / "little/11/evaluations/heavy")
-    (sweep,), _ = grouped([read_sweep("runs", ["quick"], MEASURE)])
-    results = results_of(sweep, MEASURE)
+    results = results_in("quick")
     assert [(each.run, each.reason) for each in results.exclusions] == [
         ("quick/zzz_again", "seed 10 of cart_viscous=3, cart_mass=1.5 is there twice")
     ]
@@ -85,12 +89,8 @@ def test_a_seed_counts_once_and_unequal_seeds_are_noted(study: Path) -> None:
 
 
 def test_two_sets_are_compared_group_by_group(study: Path) -> None:
-    sweeps, between = grouped(
-        [
-            read_sweep("runs", ["quick/friction/little"], MEASURE),
-            read_sweep("compare", ["quick/friction/much", "quick/friction/little/10"], MEASURE),
-        ]
-    )
+    others = read_sweep("quick/friction/much", "quick/friction/little/10", name="compare")
+    sweeps, between = grouped([read_sweep("quick/friction/little"), others])
     first, second = (results_of(sweep, MEASURE) for sweep in sweeps)
     assert between == {}  # the second set has both frictions
     page = comparison(first, second, between)
@@ -100,12 +100,8 @@ def test_two_sets_are_compared_group_by_group(study: Path) -> None:
 
 
 def test_settings_that_tell_two_sets_apart_are_not_part_of_the_groups(study: Path) -> None:
-    sweeps, between = grouped(
-        [
-            read_sweep(name, [f"quick/friction/{arm}"], MEASURE)
-            for name, arm in (("runs", "little"), ("compare", "much"))
-        ]
-    )
+    much = read_sweep("quick/friction/much", name="compare")
+    sweeps, between = grouped([read_sweep("quick/friction/little"), much])
     assert between == {"parameters.cart_viscous": ["0.2", "3"]}
     first, second = (results_of(sweep, MEASURE) for sweep in sweeps)
     page = comparison(first, second, between)
@@ -131,7 +127,7 @@ def test_failed_jobs_and_links_are_named_or_followed(study: Path) -> None:
     shutil.move(study / "much/12/evaluations/heavy", "away")
     (study / "much/12/evaluations/heavy").symlink_to(Path("away").resolve())
     (study / "again").symlink_to((study / "much/10").resolve())
-    sweep = read_sweep("runs", ["quick/friction"], MEASURE)
+    sweep = read_sweep("quick/friction")
     assert len(sweep.members) == 11
     assert [(each.run, each.reason) for each in sweep.exclusions] == [
         (failed.as_posix(), "failed: ConfigError: cart_mass is -1")
@@ -145,7 +141,7 @@ def test_the_agents_of_evaluations_count(study: Path, edit: Edit) -> None:
         edit(heavy / "config.yaml", lambda content, seed=seed: content.update(run=f"agents/{seed}"))
     edit(Path("agents/11/provenance.json"), lambda content: content["packages"].update(torch="1.0"))
     Path("agents/12/metrics.json").unlink()
-    sweep = read_sweep("runs", ["quick/friction/*/*/evaluations/heavy"], MEASURE)
+    sweep = read_sweep("quick/friction/*/*/evaluations/heavy")
     reasons = {each.run: each.reason for each in sweep.exclusions}
     assert len(sweep.members) == 4
     assert reasons["quick/friction/much/12/evaluations/heavy"] == (
@@ -153,11 +149,10 @@ def test_the_agents_of_evaluations_count(study: Path, edit: Edit) -> None:
     )
     assert "torch 1.0" in reasons["quick/friction/much/11/evaluations/heavy"]
     shutil.rmtree("agents")
-    (lost,), _ = grouped([read_sweep("runs", ["quick/friction/*/*/evaluations/heavy"], MEASURE)])
-    assert "The runs of 3 agents were not found and are not checked." in results_of(lost, MEASURE).notes
+    lost = "The runs of 3 agents were not found and are not checked."
+    assert lost in results_in("quick/friction/*/*/evaluations/heavy").notes
     edit(study / "much/10/evaluations/heavy/config.yaml", lambda content: content.update(run="."))
-    (lost,), _ = grouped([read_sweep("runs", ["quick/friction/*/*/evaluations/heavy"], MEASURE)])
-    assert "The runs of 3 agents were not found and are not checked." in results_of(lost, MEASURE).notes
+    assert lost in results_in("quick/friction/*/*/evaluations/heavy").notes
 
 
 def test_an_agent_is_found_by_its_hash_from_anywhere(
@@ -176,18 +171,17 @@ def test_an_agent_is_found_by_its_hash_from_anywhere(
     monkeypatch.chdir("other")
     for named in ("runs/first", "/elsewhere/runs/first"):
         edit(home / "config.yaml", lambda content, named=named: content.update(run=named))
-        (member,) = read_sweep("runs", [str(home)], MEASURE).members
+        (member,) = read_sweep(str(home)).members
         runs.append((member.agent and member.agent.folder, member.seeds))
     assert runs == [(home.parents[3] / "runs/first", (7,))] * 2
     (home.parents[3] / "runs/first").rename(home.parents[3] / "renamed")
     edit(home / "config.yaml", lambda content: content.update(run="runs/first", seed=5))
     shutil.rmtree("runs")
-    (member,) = read_sweep("runs", [str(home)], MEASURE).members
+    (member,) = read_sweep(str(home)).members
     assert (member.agent, member.seeds) == (None, ())  # the seed of the evaluation is not the agent's
     shutil.copytree(home, home.parent / "second")
     edit(home.parent / "second/provenance.json", lambda content: content.update(agent_sha256="of another"))
-    (lost,), _ = grouped([read_sweep("runs", [str(home), str(home.parent / "second")], MEASURE)])
-    assert len(results_of(lost, MEASURE).agents) == 2  # by their hashes
+    assert len(results_in(str(home), str(home.parent / "second")).agents) == 2  # by their hashes
 
 
 def test_an_unrelated_agent_of_the_same_name_condemns_no_copied_run(study: Path, edit: Edit) -> None:
@@ -196,7 +190,7 @@ def test_an_unrelated_agent_of_the_same_name_condemns_no_copied_run(study: Path,
     other.write_bytes(b"of this project")
     edit(heavy / "config.yaml", lambda content: content.update(run="/elsewhere/runs/first"))
     edit(heavy / "provenance.json", lambda content: content.update(agent_sha256="of another"))
-    (member,) = read_sweep("runs", [str(heavy)], MEASURE).members
+    (member,) = read_sweep(str(heavy)).members
     assert (member.agent, member.problem) == (None, "")
 
 
@@ -289,8 +283,7 @@ def test_evaluations_of_a_pretrained_agent_with_other_seeds_are_of_one_agent(stu
     for seed in (10, 11, 12):
         file = study / f"much/{seed}/evaluations/heavy/config.yaml"
         edit(file, lambda content: content.update(run="pretrained/medium"))
-    (sweep,), _ = read_groups({"runs": ["quick/friction/*/*/evaluations/heavy"]}, MEASURE)
-    results = results_of(sweep, MEASURE)
+    results = results_in("quick/friction/*/*/evaluations/heavy")
     (agent,) = (agent for agent in results.agents if "much" in agent.run)
     assert (agent.run, agent.seed_text) == ("quick/friction/much/10/evaluations/heavy", "–")
     label = results.groups[1].label
@@ -319,5 +312,5 @@ def test_agents_of_a_training_are_compared_in_pairs_on_two_carts(study: Path, ed
         edit(file, lambda content, file=file: content.update(agent_sha256=file.parts[3]))
         edit(file.with_name("config.yaml"), lambda content: content.update(run="agents/lost"))
     assert cells(compared("quick/friction/much/*/evaluations/heavy"), "agents") == ["3, paired"]
-    (lost,), _ = read_groups({"runs": ["quick/friction/*/*/evaluations/heavy"]}, MEASURE)
-    assert "The runs of 3 agents were not found and are not checked." in results_of(lost, MEASURE).notes
+    lost = "The runs of 3 agents were not found and are not checked."
+    assert lost in results_in("quick/friction/*/*/evaluations/heavy").notes

@@ -123,23 +123,15 @@ class TestResume:
         content = read(tmp_path).PluginTagToContent(metadata.PLUGIN_NAME)[metadata.SESSION_START_INFO_TAG]
         assert metadata.parse_session_start_info_plugin_data(content).hparams["frames"].number_value == 20
 
-    def test_a_record_cut_short_by_a_kill_is_dropped(self, tmp_path: Path) -> None:
+    @pytest.mark.parametrize(("lost", "zeros"), [(5, 0), (5, 4005), (20, 4020), (40, 4040)])
+    def test_what_a_kill_cut_short_or_a_power_cut_zeroed_is_dropped(
+        self, lost: int, zeros: int, tmp_path: Path
+    ) -> None:
         with TensorBoardLog(tmp_path) as log:
             log.scalars({"a": 1.0}, 1)
             log.scalars({"a": 2.0}, 2)
         (path,) = tmp_path.iterdir()
-        path.write_bytes(path.read_bytes()[:-5])
-        with TensorBoardLog(tmp_path, purge_step=2) as log:
-            log.scalars({"a": 3.0}, 2)
-        assert points(tmp_path, "a") == {1: 1.0, 2: 3.0}
-
-    @pytest.mark.parametrize("zeroed", [5, 20, 40])
-    def test_what_a_power_cut_zeroed_is_dropped(self, zeroed: int, tmp_path: Path) -> None:
-        with TensorBoardLog(tmp_path) as log:
-            log.scalars({"a": 1.0}, 1)
-            log.scalars({"a": 2.0}, 2)
-        (path,) = tmp_path.iterdir()
-        path.write_bytes(path.read_bytes()[:-zeroed] + bytes(zeroed + 4000))
+        path.write_bytes(path.read_bytes()[:-lost] + bytes(zeros))
         assert scalars(tmp_path, "a") == [(1, 1.0)]
         with TensorBoardLog(tmp_path, purge_step=2) as log:
             log.scalars({"a": 3.0}, 2)

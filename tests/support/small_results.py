@@ -9,7 +9,6 @@ from cartpole_rl.checking import validated
 from cartpole_rl.reporting.results import Agent
 
 CARTS = [{"name": "simulated", "label": "simulated cart"}, {"name": "emulated", "label": "emulated cart"}]
-KNOCKS = [{"name": f"knock_{value}", "label": f"{value} rad/s", "value": value} for value in (0, 4)]
 ARMS = [{"name": "wide", "label": "drawn"}, {"name": "none", "label": "not drawn"}]
 Values = dict[str, list[dict[str, float]]]  # of each arm's agents, by evaluation
 
@@ -45,8 +44,3 @@ def judged(name: str, values: Values, finding: dict[str, str], **changes: Any) -
 def on_carts(*pairs: tuple[float, float]) -> list[dict[str, float]]:
     """Agents on the simulated and the emulated cart."""
     return [{"simulated": first, "emulated": second} for first, second in pairs]
-
-
-def over_knocks(*pairs: tuple[float, float]) -> list[dict[str, float]]:
-    """Agents after two knocks."""
-    return [{"knock_0": first, "knock_4": second} for first, second in pairs]
