@@ -12,22 +12,8 @@ from results import SMALLEST, StudyResults
 from scipy import stats
 
 from cartpole_rl.reporting import groups, style
-from cartpole_rl.reporting.groups import (
-    DASHES,
-    DOT,
-    FEWEST_PROFILED,
-    MOST_LINES,
-    Drawing,
-    finish,
-    panel,
-)
-from cartpole_rl.reporting.results import (
-    SCORES,
-    Named,
-    estimate_text,
-    measure_label,
-    sentence_start,
-)
+from cartpole_rl.reporting.groups import DASHES, DOT, FEWEST_PROFILED, MOST_LINES, Drawing, finish, panel
+from cartpole_rl.reporting.results import SCORES, Named, estimate_text, measure_label, sentence_start
 from cartpole_rl.reporting.statistics import Array, Estimate, bootstrap, estimate
 from cartpole_rl.reporting.texts import count_text, number_text
 

@@ -12,14 +12,7 @@ from PIL import Image, ImageChops, ImageColor
 
 from cartpole_rl.drawing import colours
 from cartpole_rl.drawing.cart import CART_WIDTH, PIVOT_HEIGHT, SIZE
-from cartpole_rl.reporting.animation import (
-    LAST_FRAME,
-    durations,
-    frames,
-    gif,
-    side_by_side,
-    write_animation,
-)
+from cartpole_rl.reporting.animation import LAST_FRAME, durations, frames, gif, side_by_side, write_animation
 from cartpole_rl.tasks.episode import Episode, Origin
 
 POLE, TRACK = 0.3365, 0.407  # m

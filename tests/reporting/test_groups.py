@@ -3,12 +3,7 @@
 import numpy as np
 import pytest
 
-from cartpole_rl.reporting.groups import (
-    drawings,
-    palette,
-    profile_curves,
-    training_curves,
-)
+from cartpole_rl.reporting.groups import drawings, palette, profile_curves, training_curves
 from cartpole_rl.reporting.results import Agent, Group, Results, low_is_good
 from cartpole_rl.reporting.runs_page import figure_parts
 

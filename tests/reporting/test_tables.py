@@ -20,14 +20,8 @@ HEAVY = "much/12/evaluations/heavy"
 
 def report(format: str = "csv") -> tuple[list[dict[str, str]], list[dict[str, str]]]:
     """Make a report of the study; return its tables of runs and of episodes."""
-    done = in_process(
-        "report",
-        "runs=quick",
-        "measure=score_upright",
-        f"format={format}",
-        "hydra.run.dir=report",
-        folder=Path.cwd(),
-    )
+    words = ("runs=quick", "measure=score_upright", f"format={format}", "hydra.run.dir=report")
+    done = in_process("report", *words, folder=Path.cwd())
     assert done.code == 0, done.err
     runs, found = (Path("report", name).read_text().splitlines() for name in ("runs.csv", "episodes.csv"))
     return [*csv.DictReader(runs)], [*csv.DictReader(found)]

@@ -16,11 +16,7 @@ from cartpole_rl.physics.parameters import GRAVITY, CartParameters
 from cartpole_rl.plants.simulated import Carts, Inputs, Period, commands_under_way, encoder_counts, run_carts
 from cartpole_rl.rig.hardware import Encoders
 from cartpole_rl.rig.parameters import PARAMETERS
-from cartpole_rl.tasks.features import (
-    Measured,
-    measured_position,
-    measured_velocity,
-)
+from cartpole_rl.tasks.features import Measured, measured_position, measured_velocity
 from cartpole_rl.tasks.rewards import BONUS, score, speed_periods
 from cartpole_rl.workflows.config import TrainConfig
 
