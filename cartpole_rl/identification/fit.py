@@ -146,10 +146,10 @@ def fit_cart(
     if near is None:
         starts = [start for start in STARTS if start.keys() <= {each.name for each in unknowns}]
         screened = [problem.minimize(point_of(unknowns, start), guess, SCREENING) for start in starts]
-        best = min(screened, key=lambda each: each.cost)
+        point, motion, _ = min(screened, key=lambda each: each.cost)
     else:
-        best = Match(point_of(unknowns, near.by_name), guess, math.inf)
-    best = problem.minimize(best.point, best.motion, iterations)
+        point, motion = point_of(unknowns, near.by_name), guess
+    best = problem.minimize(point, motion, iterations)
     return described(problem, best, windows, unknowns, nominal)
 
 
@@ -162,28 +162,20 @@ def described(
     problem: Matching, best: Match, windows: Windows, unknowns: list[Unknown], nominal: dict[str, float]
 ) -> Fit:
     """Return the cart of a match with its uncertainty and residuals."""
-    residuals, normal = by_encoder(problem, best), problem.normal_equations(best.point, best.motion)
+    residuals = problem.residuals(best.point.unsqueeze(1), best.motion.unsqueeze(2))
+    residuals = residuals.squeeze(2).unflatten(1, (-1, 2))  # [W, T + 1, 2]
+    # a normal distribution has 1.4826 times the median size as its standard deviation
+    spread = 1.4826 * residuals.abs().flatten(0, 1).quantile(0.5, dim=0) * problem.scale
+    normal = problem.normal_equations(best.point, best.motion)
     return Fit(
         unknowns,
         best.point.numpy(),
         normal.covariance(torch.from_numpy(windows.episode)).numpy(),
         nominal,
-        spread(problem, best).numpy(),
+        spread.numpy(),
         np.array([neighbours_correlate(residuals[..., encoder].numpy()) for encoder in range(2)]),
         best.cost,
     )
-
-
-def by_encoder(problem: Matching, match: Match) -> Tensor:
-    """Return the scaled residuals of a match, [W, T + 1, 2]."""
-    residuals = problem.residuals(match.point.unsqueeze(1), match.motion.unsqueeze(2))
-    return residuals.squeeze(2).unflatten(1, (-1, 2))
-
-
-def spread(problem: Matching, match: Match) -> Tensor:
-    """Return the robust spread of a match's residuals, m and rad, [2]: 1.48 times their median size."""
-    sizes = by_encoder(problem, match).abs().flatten(0, 1)
-    return 1.4826 * sizes.quantile(0.5, dim=0) * problem.scale
 
 
 def neighbours_correlate(residuals: Array) -> float:

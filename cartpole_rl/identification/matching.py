@@ -199,18 +199,10 @@ class Linearization(NamedTuple):
 
 
 class Match(NamedTuple):
-    """A solution."""
+    """A point and initial states with their costs, during the search and at its end."""
 
     point: Tensor  # [U]
     motion: Tensor  # [4, W], the initial states
-    cost: float
-
-
-class Place(NamedTuple):
-    """A place in the search."""
-
-    point: Tensor  # [U]
-    motion: Tensor  # [4, W]
     costs: Tensor  # [W], without the prior of the point
 
     @property
@@ -243,7 +235,7 @@ class Matching:
         farthest = FARTHEST * STATE_SPREAD.unsqueeze(1)
         self.bounds = guess - farthest, guess + farthest
 
-    @torch.no_grad()
+    @torch.inference_mode()
     def residuals(self, points: Tensor, motion: Tensor) -> Tensor:
         """Return scaled residuals [W, R, K] at `points` [U, K] with initial states `motion` [4, W, K]."""
         scaled = scaled_residuals(self.simulate(points, motion), self.measured.unsqueeze(-1), self.scale)
@@ -277,7 +269,7 @@ class Matching:
         point's, and keeps its state where the step would not lower its cost.
         """
         costs = self.costs(point.unsqueeze(1), motion.unsqueeze(2))[:, 0]
-        now = Place(point, motion, costs)
+        now = Match(point, motion, costs)
         damping, own = FIRST_DAMPING, torch.full_like(costs, FIRST_DAMPING)
         for _ in range(iterations):
             normal, before = self.normal_equations(now.point, now.motion), now
@@ -294,12 +286,12 @@ class Matching:
                 slow = before.cost - now.cost < CONVERGED * before.cost
                 if slow or normal.length(now.point - before.point) < SETTLED:
                     break
-        return Match(now.point, now.motion, now.cost)
+        return now
 
     def best_trial(
-        self, now: Place, normal: NormalEquations, damping: float, own: Tensor
-    ) -> tuple[Place, Tensor, float]:
-        """Return the best place after one step, the windows whose states moved, [W], and its factor.
+        self, now: Match, normal: NormalEquations, damping: float, own: Tensor
+    ) -> tuple[Match, Tensor, float]:
+        """Return the best match after one step, the windows whose states moved, [W], and its factor.
 
         The dampings of the steps, all simulated side by side, are those given, times each of FACTORS.
         """
@@ -308,16 +300,16 @@ class Matching:
         motions = torch.stack([(now.motion + moves).clamp(*self.bounds) for _, moves in steps], 2)
         kept = now.motion.unsqueeze(2).expand_as(motions)
         costs, kept_costs = self.costs(points.repeat(1, 2), torch.cat((motions, kept), 2)).chunk(2, 1)
-        places = [
-            Place(
+        matches = [
+            Match(
                 points[:, k],
                 torch.where(costs[:, k] < kept_costs[:, k], motions[..., k], now.motion),
                 torch.minimum(costs[:, k], kept_costs[:, k]),
             )
             for k in range(len(FACTORS))
         ]
-        best = min(range(len(places)), key=lambda k: places[k].cost)
-        return places[best], costs[:, best] < kept_costs[:, best], FACTORS[best]
+        best = min(range(len(matches)), key=lambda k: matches[k].cost)
+        return matches[best], costs[:, best] < kept_costs[:, best], FACTORS[best]
 
 
 class InitialStates(NamedTuple):

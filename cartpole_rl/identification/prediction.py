@@ -52,7 +52,7 @@ def predicted_by_members(
     positions = torch.from_numpy(windows.positions[: lead + 1])
     scale, driven = finest_scale(windows.resolution), motors[: history + lead]
     first = match_initial_states(dynamics, positions, driven, scale, residual).motion
-    with torch.no_grad():
+    with torch.inference_mode():
         predicted = dynamics.positions(first, motors, residual)[lead:].numpy()  # [H + 1, 2, M, W]
     measured = windows.positions[lead:, :, None]
     simulated = np.where(np.isnan(measured), np.nan, predicted)

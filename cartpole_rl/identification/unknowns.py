@@ -38,16 +38,12 @@ class Unknown(NamedTuple):
     prior: Prior
 
 
-def unknowns() -> list[Unknown]:
-    """Return all unknowns: the parameters with a prior, and the length of the pole."""
-    cart, *others = [Unknown(each.name, each.prior) for each in PARAMETERS.values() if each.prior]
-    return [cart, Unknown(POLE_LENGTH, factor(0.5)), *sorted(others, key=lambda each: each.name in LEVELS)]
-
-
 def unknowns_of(models: Models, known: Sequence[str] = ()) -> list[Unknown]:
-    """Return the unknowns that the chosen models read and that are not `known`."""
+    """Return the unknowns that are not `known`: what `models` read and has a prior, and the pole's length."""
+    cart, *others = [Unknown(each.name, each.prior) for each in PARAMETERS.values() if each.prior]
+    every = [cart, Unknown(POLE_LENGTH, factor(0.5)), *sorted(others, key=lambda each: each.name in LEVELS)]
     without = {*unused_parameters(models), *known}
-    return [unknown for unknown in unknowns() if unknown.name not in without]
+    return [unknown for unknown in every if unknown.name not in without]
 
 
 def hidden(nominal: Mapping[str, float]) -> tuple[str, ...]:

@@ -6,16 +6,15 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
-from tensordict import TensorDictBase
+from shaken import MOTORS, shaken
 
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import RecordingError
-from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.identification.fit import Fit, fit_cart
 from cartpole_rl.identification.identify import warnings
 from cartpole_rl.identification.prediction import errors_at, predict, root_mean_square
 from cartpole_rl.identification.rollout import Dynamics, rollout
-from cartpole_rl.identification.unknowns import limits, parameters_at, unknowns, unknowns_of
+from cartpole_rl.identification.unknowns import limits, parameters_at, unknowns_of
 from cartpole_rl.identification.windows import (
     HELD_OUT_LEAD,
     WINDOW,
@@ -34,7 +33,6 @@ from cartpole_rl.rig.parameters import POSITIVE, Parameter, factor
 from cartpole_rl.tasks.episode import Episode
 
 PERIOD = 0.02
-MOTORS = (-250, -150, 0, 150, 250)
 STEP = Models.of(cart_friction="step")
 TRUTH = {
     "cart_viscous": 1.2,
@@ -59,18 +57,7 @@ MakeEnvironment = Callable[..., CartPoleEnv]
 @pytest.fixture(scope="module")
 def episodes(make_plant: MakePlant, make_environment: MakeEnvironment) -> list[Episode]:
     """Four times ten seconds of a cart that is shaken: each motor value is held for 0.2 s."""
-    random = torch.Generator().manual_seed(0)
-    held: list[torch.Tensor] = []
-
-    def shake(present: object) -> object:
-        if len(held) % 10 == 0:
-            held.append(torch.randint(len(MOTORS), (4,), generator=random))
-        else:
-            held.append(held[-1])
-        return present.set("action", held[-1])  # type: ignore[attr-defined]
-
-    env = make_environment(make_plant(4, cart=TRUTH, models=STEP), MOTORS)
-    return run_batch(env, shake)  # type: ignore[arg-type]
+    return shaken(make_environment(make_plant(4, cart=TRUTH, models=STEP), MOTORS))
 
 
 def test_the_true_cart_predicts_every_count(episodes: list[Episode], nominal: dict[str, float]) -> None:
@@ -90,12 +77,9 @@ def test_a_fit_finds_another_pole(
     both_poles: PoleSettings,
     nominal: dict[str, float],
 ) -> None:
-    random = torch.Generator().manual_seed(0)
     large = PoleSettings(choices={"large": (both_poles.choices or {})["large"]})
-    env = make_environment(
-        make_plant(2, poles=large, models=STEP, cart={"track_half_length": 2.0}), MOTORS, time_limit=300
-    )
-    recorded = run_batch(env, lambda present: present.set("action", torch.randint(5, (2,), generator=random)))
+    plant = make_plant(2, poles=large, models=STEP, cart={"track_half_length": 2.0})
+    recorded = shaken(make_environment(plant, MOTORS, time_limit=300), hold=1)
     found = fit_cart(cut_windows(recorded, PERIOD, most=16), nominal, STEP, PERIOD).parameters
     assert found["pole_com"] == pytest.approx(large.nominal.pole_com, rel=0.05)
 
@@ -112,8 +96,10 @@ def test_counts_that_jump_are_no_carts(episodes: list[Episode], nominal: dict[st
     assert "\n" not in str(raised.value)
 
 
-def test_draws_are_physically_possible(episodes: list[Episode], nominal: dict[str, float]) -> None:
-    fit = fit_cart(cut_windows(episodes, PERIOD, most=10), nominal, STEP, PERIOD, iterations=3)
+def test_draws_are_physically_possible(nominal: dict[str, float]) -> None:
+    unknowns = unknowns_of(STEP)
+    point, covariance = np.zeros(len(unknowns)), np.eye(len(unknowns))
+    fit = Fit(unknowns, point, covariance, nominal, np.zeros(2), np.zeros(2), 1.0)
     drawn = dict(
         zip(CartParameters.names(), fit.draw(500, np.random.default_rng(0), widen=20.0), strict=True)
     )
@@ -174,17 +160,9 @@ class TestWindows:
     ) -> None:
         """At a control period of 5 ms, motor values 50 ms ago still act on the cart."""
         period, latency = 0.005, 0.05
-        random = torch.Generator().manual_seed(0)
-        held: list[torch.Tensor] = []
-
-        def shake(present: TensorDictBase) -> TensorDictBase:
-            again = held and len(held) % 40
-            held.append(held[-1] if again else torch.randint(len(MOTORS), (2,), generator=random))
-            return present.set("action", held[-1])
-
         cart = {**TRUTH, "latency": latency}
         plant = make_plant(2, cart=cart, models=STEP, period=period, substeps=4)
-        recorded = run_batch(make_environment(plant, MOTORS, time_limit=250), shake)
+        recorded = shaken(make_environment(plant, MOTORS, time_limit=250), hold=40)
         windows = cut_windows(recorded, period, most=4)
         assert windows.periods * period == pytest.approx(WINDOW)
         assert len(windows.motors) == windows.periods + history_periods(period)
@@ -255,7 +233,7 @@ def test_every_fifth_is_held_out_or_the_last_fifth_of_a_few() -> None:
 def test_a_parameter_is_unusual_or_not_shown_but_not_both(
     nominal: dict[str, float], point: float, said: str
 ) -> None:
-    mass = next(each for each in unknowns() if each.name == "cart_mass")
+    (mass,) = (each for each in unknowns_of(STEP) if each.name == "cart_mass")
     fit = Fit([mass], np.array([point]), np.array([[0.9]]), nominal, np.zeros(2), np.zeros(2), 1.0)
     (warning,) = warnings(fit, nominal_encoders())
     assert said in warning

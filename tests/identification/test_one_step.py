@@ -5,13 +5,7 @@ import pytest
 import torch
 
 from cartpole_rl.choices import choice
-from cartpole_rl.identification.one_step import (
-    FRICTION_AND_FORCE,
-    MASSES,
-    Transitions,
-    predicted,
-    regression,
-)
+from cartpole_rl.identification.one_step import FRICTION_AND_FORCE, MASSES, Transitions, predicted, regression
 from cartpole_rl.physics.friction import CART_FRICTIONS
 from cartpole_rl.physics.models import Models
 
