@@ -8,12 +8,7 @@ import torch
 from cartpole_rl.physics.dynamics import Drive, State, run_period
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
-from cartpole_rl.physics.residual import (
-    PLACES,
-    Residual,
-    chosen_members,
-    members_in_turn,
-)
+from cartpole_rl.physics.residual import PLACES, Residual, chosen_members, members_in_turn
 
 MakeCart = Callable[..., CartParameters]
 STEP = Models.of(cart_friction="step")

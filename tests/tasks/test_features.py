@@ -24,22 +24,17 @@ def counts(cart: int, pole: int) -> torch.Tensor:
 
 
 class TestPosition:
-    def test_a_turn_is_4096_counts(self) -> None:
-        x, theta = measured_position(counts(1000, 1024), IP02)
-        assert x.item() == pytest.approx(1000 * 2.2749e-5)
-        assert theta.item() == pytest.approx(math.pi / 2)
-
     def test_travel_is_that_of_the_real_cart(self) -> None:
-        travel = 35782 * nominal_encoders().metres
+        travel = 35782 * IP02.metres
         assert travel == pytest.approx(0.814, abs=1e-4)
 
     @given(
         angle=st.integers(-2048, 2047), turns=st.integers(-(2**30), 2**30), cart=st.integers(-(2**20), 2**20)
     )
     def test_turns_do_not_matter(self, angle: int, turns: int, cart: int) -> None:
-        x, theta = measured_position(counts(cart, angle + turns * nominal_encoders().turn), IP02)
+        x, theta = measured_position(counts(cart, angle + turns * IP02.turn), IP02)
         assert theta.item() == pytest.approx(angle * 2 * math.pi / 4096, abs=1e-6)
-        assert x.item() == pytest.approx(cart * nominal_encoders().metres, rel=1e-6)
+        assert x.item() == pytest.approx(cart * IP02.metres, rel=1e-6)
 
     @given(cart=st.integers(-(2**20), 2**20), pole=st.integers(-2047, 2047))
     def test_left_mirrors_right(self, cart: int, pole: int) -> None:
@@ -64,7 +59,7 @@ def test_encoders_of_any_number_of_counts_wrap_within_half_a_turn(turn: int, pol
 class TestVelocity:
     def test_is_over_the_time_that_passed(self) -> None:
         x_dot, _ = measured_velocity(counts(100, 0), counts(-100, 0), torch.tensor([0.04]), IP02)
-        assert x_dot.item() == pytest.approx(200 * nominal_encoders().metres / 0.04)
+        assert x_dot.item() == pytest.approx(200 * IP02.metres / 0.04)
 
     def test_does_not_jump_where_the_angle_wraps(self) -> None:
         _, theta_dot = measured_velocity(counts(0, 2049), counts(0, 2047), torch.tensor([0.02]), IP02)
