@@ -3,6 +3,7 @@
 import io
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -83,18 +84,32 @@ def test_the_identified_cart_carries_the_given_pole(
     assert {round(mass, 3) for mass in drawn[MASS].tolist()} == {0.9, 1.0}
 
 
-def of_samples(path: Path, text: str) -> IdentifiedSettings:
-    path.write_text(text)
-    return IdentifiedSettings(posterior=path, ranges={"cart_mass": Range(absolute=(2.0, 3.0))})
+@pytest.fixture
+def sampled(ip02: dict[str, float], medium: PoleSettings, tmp_path: Path) -> Callable[..., IdentifiedCarts]:
+    """The carts of a .csv file; a mass without a column is 2 to 3 kg."""
+    path, ranges = tmp_path / "carts.csv", {"cart_mass": Range(absolute=(2.0, 3.0))}
+
+    def build(text: str, **settings: Any) -> IdentifiedCarts:
+        path.write_text(text)
+        return identified_carts(
+            IdentifiedSettings(posterior=path, **{"ranges": ranges, **settings}), ip02, medium
+        )
+
+    return build
 
 
-def test_samples_of_a_file_stay_together_by_row(
-    ip02: dict[str, float], medium: PoleSettings, tmp_path: Path
-) -> None:
+def drawn(carts: IdentifiedCarts) -> CartParameters:
+    return CartParameters(carts.draw(500, torch.Generator().manual_seed(0)))
+
+
+def numbers(values: torch.Tensor) -> list[float]:
+    """The different numbers, in order."""
+    return sorted({round(value, 4) for value in values.tolist()})
+
+
+def test_samples_of_a_file_stay_together_by_row(sampled: Callable) -> None:
     """A parameter without a column is drawn from its range."""
-    text = "\ufeffcart_viscous, cart_coulomb\n0.1,0.5\n0.2,0.6\n0.4,0.3\n"
-    draws = identified_carts(of_samples(tmp_path / "carts.csv", text), ip02, medium)
-    carts = CartParameters(draws.draw(500, torch.Generator().manual_seed(0)))
+    carts = drawn(sampled("\ufeffcart_viscous, cart_coulomb\n0.1,0.5\n0.2,0.6\n0.4,0.3\n"))
     pairs = {
         (round(a, 4), round(b, 4))
         for a, b in zip(carts.cart_viscous.tolist(), carts.cart_coulomb.tolist(), strict=True)
@@ -118,38 +133,26 @@ def test_samples_of_a_file_stay_together_by_row(
         ("pole_com\n0.3\n", "has pole_com of another pole than pole=: leave these columns out"),
     ],
 )
-def test_samples_that_are_no_carts_are_refused(
-    text: str, reason: str, ip02: dict[str, float], medium: PoleSettings, tmp_path: Path
-) -> None:
+def test_samples_that_are_no_carts_are_refused(sampled: Callable, text: str, reason: str) -> None:
     with pytest.raises(ConfigError, match=reason) as raised:
-        identified_carts(of_samples(tmp_path / "carts.csv", text), ip02, medium)
+        sampled(text)
     assert "\n" not in str(raised.value)
 
 
-def test_a_pole_column_alone_is_drawn(ip02: dict[str, float], medium: PoleSettings, tmp_path: Path) -> None:
-    draws = identified_carts(of_samples(tmp_path / "carts.csv", "pole_mass\n0.12\n0.13\n"), ip02, medium)
-    drawn = CartParameters(draws.draw(100, torch.Generator().manual_seed(0))).pole_mass
-    assert {round(mass, 3) for mass in drawn.tolist()} == {0.12, 0.13}
+def test_a_pole_column_alone_is_drawn(sampled: Callable) -> None:
+    assert numbers(drawn(sampled("pole_mass\n0.12\n0.13\n")).pole_mass) == [0.12, 0.13]
 
 
-def test_a_cart_without_mass_is_not_drawn(
-    ip02: dict[str, float], medium: PoleSettings, tmp_path: Path
-) -> None:
-    settings = of_samples(tmp_path / "carts.csv", "cart_mass,cart_coulomb\n0.3,0\n0.7,0.2\n2,0.3\n")
+def test_a_cart_without_mass_is_not_drawn(sampled: Callable) -> None:
     """A mass is widened in its logarithm, friction until it is 0."""
-    draws = identified_carts(settings.model_copy(update={"widen": 2.0}), ip02, medium)
-    drawn = CartParameters(draws.draw(500, torch.Generator().manual_seed(0)))
-    assert sorted({round(mass, 4) for mass in drawn.cart_mass.tolist()}) == [0.1286, 0.7, 5.7143]
-    assert sorted({round(friction, 4) for friction in drawn.cart_coulomb.tolist()}) == [0, 0.2, 0.4]
+    carts = drawn(sampled("cart_mass,cart_coulomb\n0.3,0\n0.7,0.2\n2,0.3\n", widen=2.0))
+    assert numbers(carts.cart_mass) == [0.1286, 0.7, 5.7143]
+    assert numbers(carts.cart_coulomb) == [0, 0.2, 0.4]
 
 
-def test_the_longest_delay_is_that_of_a_cart_with_the_jitter_of_the_range(
-    ip02: dict[str, float], medium: PoleSettings, tmp_path: Path
-) -> None:
-    settings = of_samples(tmp_path / "carts.csv", "latency\n0.02\n0.01\n")
-    ranges = {"latency_jitter": Range(absolute=(0.0, 0.01))}
-    draws = identified_carts(settings.model_copy(update={"ranges": ranges}), ip02, medium)
-    assert draws.longest_delay() == pytest.approx(0.03)
+def test_the_longest_delay_is_that_of_a_cart_with_the_jitter_of_the_range(sampled: Callable) -> None:
+    jitter = {"latency_jitter": Range(absolute=(0.0, 0.01))}
+    assert sampled("latency\n0.02\n0.01\n", ranges=jitter).longest_delay() == pytest.approx(0.03)
 
 
 def saved(*arrays: object, **named: object) -> bytes:
