@@ -608,8 +608,12 @@ def _unknown_setting(setting: str, command: str, words: Sequence[str]) -> str:
         if groups[group] is None and group not in map(key_of, words):
             known = ", ".join(group_choices(group))
             return f"{setting}: {group} is not chosen, so it has no settings; give {group}= too: {known}"
-        choices = group_choices(group) if group != setting else ()
-        if owners := [name for name in choices if setting in known_settings(command, [f"{group}={name}"])]:
+        owners = [
+            name
+            for name, values in group_choices(group).items()
+            if setting in setting_names({group: _with_defaults(group, values)})
+        ]
+        if owners and setting != group:
             return of_another_choice(setting, owners)
     chosen = [word for word in words if re.fullmatch(r"\w+=[\w.-]+", word)]
     return no_such_setting(setting, known_settings(command, chosen) or known_settings(command, []))
