@@ -102,11 +102,7 @@ def program_of(folder: Path) -> str | None:
 
 def recorded_provenance(folder: Path) -> dict[str, Any]:
     """Return the provenance.json of the run in `folder`; empty if it is missing or damaged."""
-    try:
-        recorded = json.loads((folder / PROVENANCE).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return recorded if isinstance(recorded, dict) else {}
+    return read_json(folder / PROVENANCE)
 
 
 def recorded_config(folder: Path) -> dict[str, Any]:
@@ -159,11 +155,7 @@ def use_of(folder: Path, program: str) -> str:
 
 def repeatable(folder: Path) -> bool:
     """Return whether an evaluation drove simulated carts, whose episodes can be driven again."""
-    try:
-        metrics = json.loads((folder / METRICS).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return False
-    return isinstance(metrics, dict) and metrics.get("plant") == "simulated"
+    return read_json(folder / METRICS).get("plant") == "simulated"
 
 
 def has_ended(run: Path) -> bool:
@@ -262,10 +254,7 @@ def write_inputs(folder: Path, needs: Iterable[Path]) -> None:
 
 def is_outdated(folder: Path) -> bool:
     """Return True if a run that the run in `folder` needs was made again since, with another result."""
-    try:
-        recorded = dict(json.loads((folder / INPUTS).read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError):
-        return False
+    recorded = read_json(folder / INPUTS)
     there = {folder / name: was for name, was in recorded.items() if (folder / name).is_file()}
     return any(file_hash(file) != was for file, was in there.items())
 
@@ -293,6 +282,15 @@ def git_commit() -> str | None:
     except OSError:
         return None
     return found.stdout.strip() or None
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Return the mapping in a JSON file; empty if it is missing or damaged."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}
 
 
 def write_json(path: Path, content: Any) -> None:
