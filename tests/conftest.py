@@ -11,6 +11,7 @@ Hypothesis sets no deadlines: no test fails because a machine is slow.
 
 Torch takes one thread, here and in children: the work of a test is small, and threads would wait busily.
 Python collects garbage seldom: with torch imported, it would take a sixth of the time of a small command.
+Hydra reads each file of conf/ once: reading them would take a third of the time of a composition.
 """
 
 import gc
@@ -21,11 +22,11 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+import files_read_once  # noqa: F401
 import pytest
 import torch
 import yaml
 from command_line import no_pictures
-from hydra_configs import shipped_choices
 from hypothesis import HealthCheck, settings
 
 from cartpole_rl.envs.build import make_env
@@ -64,13 +65,6 @@ for name in ("SIGINT", "SIGHUP", "SIGQUIT", "SIGTERM"):  # Windows has the first
 def conf(choice: str) -> dict[str, Any]:
     """Return the content of a file of conf/."""
     return yaml.safe_load((CONF / f"{choice}.yaml").read_text())
-
-
-@pytest.fixture(scope="module")
-def hydra_reads_conf() -> Iterator[None]:
-    """Let the tests of a module call `hydra.compose`."""
-    with shipped_choices():
-        yield
 
 
 @pytest.fixture(scope="session")

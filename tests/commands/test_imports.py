@@ -74,12 +74,9 @@ COMPLAINS = {  # command: words, exit code, part of the line on stderr
     "replay": [("from=nowhere", 2, "from=nowhere: there is no such file or folder")],
     "train": [
         ("resume=nowhere", 1, "resume=nowhere: there is no such folder"),
-        ("seed=abc", 2, "give an integer"),
-        ("agent.gamma=1.5", 2, "give less than 1"),
         ("agent.hidden=[7]", 2, "even numbers of units"),
         ("cart.cart_mass=-1", 2, "cart_mass is -1"),
         ("randomization.cart_mass.relative=[-1.5,0]", 2, "it must be above 0"),
-        ("pole=tiny", 2, "both, laboratorio, large, medium, range"),
     ],
 }
 WORK = {  # what only work needs
@@ -92,8 +89,11 @@ WORK = {  # what only work needs
     "torch",
     "torchrl",
 }
+SUPPORT = str(Path(__file__).parents[1] / "support")
 RUN_IN_TURN = """
 import contextlib, io, json, sys
+sys.path.append({support!r})
+import files_read_once
 from hydra.core.global_hydra import GlobalHydra
 from cartpole_rl.cli import run
 
@@ -138,7 +138,7 @@ def test_help_completion_and_errors_need_no_slow_imports(tmp_path: Path) -> None
         shows = SHOWS if command in ("train", "preflight") else SHOWS[:1]
         cases += [(command, *case) for case in (*shows, *complaints)]
     cases.append(("preflight", "plant.port=nowhere", 1, ""))
-    script = RUN_IN_TURN.format(commands=[case[:2] for case in cases])
+    script = RUN_IN_TURN.format(commands=[case[:2] for case in cases], support=SUPPORT)
     runs = last_line(script, tmp_path, **COMPLETION)
     for (command, words, expected, part), (code, said, modules) in zip(cases, runs, strict=True):
         slow = WORK if words == "plant.port=nowhere" else {*WORK, "numpy"}

@@ -8,9 +8,9 @@ from pathlib import Path
 import hydra
 import pytest
 from command_line import COARSE, Outcome, in_process
-from hydra_configs import shipped_choices
 
 from cartpole_rl.command import wrapped
+from cartpole_rl.composition import reading_conf
 
 pytestmark = pytest.mark.usefixtures("without_pictures")
 SIMULATED = "cartpole-evaluate run=run plant=emulated"
@@ -20,7 +20,7 @@ EMULATED = "cartpole-finetune run=run plant=emulated emulator.physics_step=0.001
 def compose(command: str) -> None:
     """Compose the settings of a command line; Hydra raises an error for a wrong word."""
     program, *words = shlex.split(command)
-    with shipped_choices():
+    with reading_conf():
         hydra.compose(program.removeprefix("cartpole-"), words)
 
 

@@ -11,8 +11,9 @@ import hydra
 import pytest
 from command_line import in_process
 from hydra.core.global_hydra import GlobalHydra
-from hydra_configs import shipped_choices
 from omegaconf import DictConfig
+
+from cartpole_rl.composition import reading_conf
 
 COMMANDS = ("evaluate", "finetune", "identify", "model", "record", "replay", "report", "train")
 
@@ -34,7 +35,7 @@ def same_second(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def composing_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.chdir(tmp_path)
-    with shipped_choices():
+    with reading_conf():
         yield
 
 
@@ -45,45 +46,30 @@ def folder_of_a_job(multirun: DictConfig, word: str) -> str:
 
 
 def folder_in_another_process(multirun: DictConfig, word: str, cwd: str) -> str:
-    with contextlib.chdir(cwd), shipped_choices():
+    with contextlib.chdir(cwd), reading_conf():
         return folder_of_a_job(multirun, word)
 
 
 def test_two_multiruns_of_the_same_second(tmp_path: Path, same_second: None) -> None:
-    for start in ("hanging", "upright"):
-        words = (
-            "run=lqr",
-            "episodes=1",
-            "seed=0,1",
-            "task=swingup",
-            "task.time_limit=10",
-            f"task.evaluation_start.angle={start}",
-        )
-        done = in_process("record", "-m", *words, folder=tmp_path)
+    for _ in range(2):
+        words = ("-m", "run=lqr", "seed=0,1")
+        done = in_process("record", *words, folder=tmp_path, function=lambda folder: (folder / "run").touch())
         assert done.code == 0, done.err
-    jobs = {
-        multirun.name: sorted(job.name for job in multirun.iterdir() if job.is_dir())
-        for multirun in tmp_path.glob("runs/record/*")
-    }
-    day = "2026-11-21_12-00-00_multirun"
-    assert jobs == {day: ["0_seed-0", "1_seed-1"], f"{day}_2": ["0_seed-0", "1_seed-1"]}
-    assert len(list(tmp_path.glob("runs/record/*/*/recordings/episode_000.csv"))) == 4
+    found = {path.relative_to(tmp_path).as_posix() for path in tmp_path.glob("runs/record/*/*/*")}
+    multiruns = (f"runs/record/2026-11-21_12-00-00_multirun{suffix}" for suffix in ("", "_2"))
+    assert found == {f"{multirun}/{seed}_seed-{seed}/run" for multirun in multiruns for seed in (0, 1)}
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_gives_each_multirun_its_own(
+def test_every_command_gives_all_jobs_a_new_folder(
     command: str, composing_here: None, same_second: None
 ) -> None:
-    given = {"evaluate": ["run=any"], "record": ["run=any"], "replay": ["from=any"], "model": ["from=any"]}
-    multiruns = [hydra.compose(command, given.get(command, []), return_hydra_config=True) for _ in range(2)]
-    folders = [multirun.hydra.sweep.dir for multirun in multiruns]
-    assert len(set(folders)) == 2
-    assert all(
-        Path(folder).is_dir() and Path(folder).parent == Path.cwd() / "runs" / command for folder in folders
-    )
-    for multirun, folder in zip(multiruns, folders, strict=True):
-        assert folder_of_a_job(multirun, "label=first") == folder
-    assert len(list(Path("runs", command).iterdir())) == 2
+    earlier = Path("runs", command, "2026-11-21_12-00-00_multirun")
+    earlier.mkdir(parents=True)
+    multirun = hydra.compose(command, return_hydra_config=True)
+    new = Path.cwd() / f"{earlier}_2"
+    assert multirun.hydra.sweep.dir == folder_of_a_job(multirun, "label=first") == str(new)
+    assert {*Path("runs", command).iterdir()} == {earlier, new.relative_to(Path.cwd())}
 
 
 def test_jobs_in_other_processes_share_the_folder(tmp_path: Path, composing_here: None) -> None:

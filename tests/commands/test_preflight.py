@@ -6,10 +6,9 @@ from pathlib import Path
 import hydra
 import pytest
 from command_line import in_process
-from hydra_configs import shipped_choices
 
 from cartpole_rl.checking import validated
-from cartpole_rl.composition import compose
+from cartpole_rl.composition import compose, reading_conf
 from cartpole_rl.workflows.config import PreflightConfig
 from cartpole_rl.workflows.preflight import next_command
 
@@ -33,7 +32,7 @@ def test_the_emulated_cart_is_ready(tmp_path: Path) -> None:
         == "The cart is ready. Next, hold the pole up when asked (pretrained/large is for one of 0.66 m):"
     )
     assert following == f"cartpole-evaluate run=pretrained/large task=balance {' '.join(words)} episodes=1"
-    with shipped_choices():
+    with reading_conf():
         hydra.compose("evaluate", following.split()[1:])
     journal = tmp_path / "journal"
     taken = [line for line in journal.read_text().splitlines() if '"took"' in line]

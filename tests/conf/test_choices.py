@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from functools import cache
-from itertools import zip_longest
+from itertools import chain, zip_longest
 from typing import Any
 
 import pytest
@@ -10,7 +10,7 @@ import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from cartpole_rl.checking import validated
-from cartpole_rl.choices import conf_folder
+from cartpole_rl.choices import conf_folder, default_choices, load
 from cartpole_rl.composition import compose
 from cartpole_rl.envs.build import randomizer
 from cartpole_rl.errors import ConfigError
@@ -46,7 +46,7 @@ def composed(name: str, *overrides: str) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def trained(hydra_reads_conf: None) -> TrainConfig:
+def trained() -> TrainConfig:
     """Without a guard, whose numbers an evaluation would fit anew."""
     return validated(TrainConfig, composed("train", "guard=none"))
 
@@ -99,14 +99,14 @@ def test_an_experiment_holds_only_differences(experiment: str) -> None:
     """
     content = yaml.safe_load((CONF / f"experiment/{experiment}.yaml").read_text()) or {}
     lines = content.pop("defaults", [])
-    extended = [f"experiment={line}" for line in lines if isinstance(line, str)]
+    extended = [line for line in lines if isinstance(line, str)]
     groups = dict(next(iter(line.items())) for line in lines if isinstance(line, dict))
     chosen = {name.removeprefix("override /"): choice for name, choice in groups.items()}
     if not experiment.startswith("thesis"):
-        cases = {group: composed("train", *extended, f"{group}={choice}") for group, choice in chosen.items()}
-        assert not [group for group, case in cases.items() if case == composed("train", *extended)]
-    words = (f"{group}={name}" for group, name in chosen.items())
-    before = dict(leaves(composed("train", *extended, *words)))
+        others = default_choices("train") | dict(load("experiment", extended).groups)
+        assert not [group for group in chosen if load(group, chosen[group]) == load(group, others[group])]
+    words = (f"experiment={line}" for line in extended), (f"{group}={name}" for group, name in chosen.items())
+    before = dict(leaves(composed("train", *chain(*words))))
     assert not [name for name, value in leaves(content) if name in before and before[name] == value]
 
 
