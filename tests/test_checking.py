@@ -40,8 +40,3 @@ def test_the_kind_of_a_plant_is_no_part_of_a_key(kind: str) -> None:
 def test_the_kind_of_a_randomization_is_no_part_of_a_key(randomization: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=rf"(^|; ){message}"):
         validated(TrainConfig, {**compose("train"), "randomization": randomization})
-
-
-def test_a_missing_setting_is_named_with_its_remedy() -> None:
-    with pytest.raises(ConfigError, match="run is missing; give run=runs/train/<run>"):
-        validated(EvaluateConfig, compose("evaluate"))

@@ -10,8 +10,6 @@ from pathlib import Path
 
 from cartpole_rl.terminal import confirm
 
-FOLDERS = ["runs", "100%", "a:b", "-x", "my runs", "a=b", "a,b", "a #b", "a: b", "é", "[x]", "x]", "{seed}"]
-FOLDERS += ["it's", "'q'", '"', '\\"', "a\\b", "~", "*x", "&x", "!x", "null", "a/../b", "$x", "(x)", "a;b"]
 ASK = """
 import sys
 from cartpole_rl.terminal import confirm

@@ -45,16 +45,20 @@ WRONG_TRAINING = [
 ]
 
 
+def assert_refused(command: str, words: str, named: str, remedy: str, code: int, folder: Path) -> None:
+    done = in_process(command, *words.split(), folder=folder)
+    assert done.complaint.startswith(f"cartpole-{command}: ")
+    assert named in done.complaint
+    assert remedy in done.complaint
+    assert (done.code, done.out) == (code, "")
+    assert not (folder / "runs" / command).exists()
+
+
 @pytest.mark.parametrize(
     ("words", "named", "remedy"), WRONG_TRAINING, ids=[case[0] for case in WRONG_TRAINING]
 )
 def test_training(words: str, named: str, remedy: str, tmp_path: Path) -> None:
-    done = in_process("train", *words.split(), folder=tmp_path)
-    assert done.complaint.startswith("cartpole-train: ")
-    assert named in done.complaint
-    assert remedy in done.complaint
-    assert done.code == 2
-    assert done.out == ""
+    assert_refused("train", words, named, remedy, 2, tmp_path)
     assert not (tmp_path / "runs").exists()
 
 
@@ -183,13 +187,7 @@ def files(trained: Path, stopped: Path) -> Path:
     ("words", "named", "remedy", "code"), WRONG_EVALUATION, ids=[case[0] for case in WRONG_EVALUATION]
 )
 def test_evaluation(words: str, named: str, remedy: str, code: int, files: Path) -> None:
-    done = in_process("evaluate", *words.split(), folder=files)
-    assert done.complaint.startswith("cartpole-evaluate: ")
-    assert named in done.complaint
-    assert remedy in done.complaint
-    assert done.code == code
-    assert done.out == ""
-    assert not (files / "runs/evaluate").exists()
+    assert_refused("evaluate", words, named, remedy, code, files)
 
 
 @pytest.mark.parametrize("command", ["finetune", "identify", "preflight"])
@@ -266,6 +264,7 @@ def test_without_a_compiler_the_remedy_is_stated(tmp_path: Path, monkeypatch: py
     assert not list(tmp_path.glob("runs/train/*"))
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_in_a_multirun_the_other_jobs_run(tmp_path: Path) -> None:
     done = in_process("train", "-m", *TINY, ONCE, "cart.cart_mass=-1,0.9", folder=tmp_path)
     assert done.code == 1

@@ -1,7 +1,7 @@
 """A user's own files and mappings: the commands and the Python API find them, and read the same from them."""
 
 import shlex
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from cartpole_rl.choices import default_choices, group_choices
 from cartpole_rl.composition import compose
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.settings import Settings
-from cartpole_rl.terminal import as_value, as_word
+from cartpole_rl.terminal import as_word
 from cartpole_rl.workflows.config import TrainConfig, load_settings
 
 TENTH = {"cart_mass": {"relative": [-0.1, 0.1]}}
@@ -248,9 +248,8 @@ def test_interpolation_in_a_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "value", ["a b", "a'b", 'a"b', "a,b", "a=b", "[a]", "{a}", "a#b", "a\\", "a$b", "é", "a:b", "a;b"]
 )
-@pytest.mark.parametrize("written", [as_word, lambda name, value: f"{name}={as_value(value)}"])
-def test_a_printed_word_survives_the_shell_and_hydra(written: Callable[[str, str], str], value: str) -> None:
-    (word,) = shlex.split(written("run", value))
+def test_a_printed_word_survives_the_shell_and_hydra(value: str) -> None:
+    (word,) = shlex.split(as_word("run", value))
     override = OverridesParser.create().parse_override(word)
     assert (override.is_sweep_override(), override.value()) == (False, value)
 

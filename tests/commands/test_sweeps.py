@@ -9,7 +9,7 @@ from omegaconf import OmegaConf
 
 from cartpole_rl.composition import EXTRAS
 from cartpole_rl.reporting.loggers import sweep_of
-from cartpole_rl.sweeps import SweepStart, _jobs, as_multirun
+from cartpole_rl.sweeps import SweepStart, _jobs
 from cartpole_rl.workflows.config import TrainConfig
 
 FAILS = "cart.cart_mass=-1"  # at once, by a check of the job: the type is right
@@ -105,12 +105,6 @@ def test_commands_without_a_run_folder_report_too(tmp_path: Path) -> None:
     assert "2 of 2 jobs failed in multirun/" in done.err
 
 
-def test_an_unknown_setting_ends_a_sweep_before_its_first_job(tmp_path: Path) -> None:
-    done = in_process("train", "-m", "seeed=0,1", folder=tmp_path)
-    assert done.code == 2
-    assert "did you mean seed?" in done.complaint
-
-
 @pytest.mark.parametrize("choice", EXTRAS)
 def test_a_missing_extra_is_named(choice: str, tmp_path: Path) -> None:
     group, _, name = choice.rpartition("/")
@@ -123,9 +117,3 @@ def test_a_missing_extra_is_named(choice: str, tmp_path: Path) -> None:
     assert done.complaint.endswith(
         f'needs the extra {EXTRAS[choice]}: pip install "cartpole_rl[{EXTRAS[choice]}]"'
     )
-
-
-def test_dash_m_is_added_once() -> None:
-    assert as_multirun(["sweep=seeds"]) == ["sweep=seeds", "--multirun"]
-    assert as_multirun(["-m", "sweep=seeds"]) == ["-m", "sweep=seeds"]
-    assert as_multirun(["seed=1"]) == ["seed=1"]
