@@ -5,13 +5,11 @@ import errno
 import pytest
 from hydra.errors import HydraException
 
-from cartpole_rl.choices import default_choices
+from cartpole_rl.choices import WHOLE, default_choices
 from cartpole_rl.command import wrong_option
 from cartpole_rl.composition import error_message, known_settings
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.exits import one_line
-
-WHOLE = ("experiment", "sweep")
 
 
 def hydra_complaint(text: str, command: str, *words: str) -> str:
@@ -66,6 +64,7 @@ def test_a_setting_of_each_group_without_a_choice_gets_one_line(command: str) ->
     ("command", "key", "complaint"),
     [
         ("evaluate", "plant.port", "plant.port belongs to plant=driver, serial or text: give one of them"),
+        ("evaluate", "plant.baud", "plant.baud belongs to plant=driver, serial or text: give one of them"),
         ("finetune", "learner.address", "learner.address belongs to learner=ray: give learner=ray"),
         ("train", "pole.lengths", "pole.lengths belongs to pole=range: give pole=range"),
         ("preflight", "port", "port: there is no such setting; did you mean plant.port?"),

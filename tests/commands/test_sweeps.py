@@ -9,7 +9,7 @@ from omegaconf import OmegaConf
 
 from cartpole_rl.composition import EXTRAS
 from cartpole_rl.reporting.loggers import sweep_of
-from cartpole_rl.sweeps import SweepStart, _jobs
+from cartpole_rl.sweeps import SweepStart, _jobs, as_multirun
 from cartpole_rl.workflows.config import TrainConfig
 
 FAILS = "cart.cart_mass=-1"  # at once, by a check of the job: the type is right
@@ -117,3 +117,9 @@ def test_a_missing_extra_is_named(choice: str, tmp_path: Path) -> None:
     assert done.complaint.endswith(
         f'needs the extra {EXTRAS[choice]}: pip install "cartpole_rl[{EXTRAS[choice]}]"'
     )
+
+
+def test_dash_m_is_added_once() -> None:
+    assert as_multirun(["sweep=seeds"]) == ["sweep=seeds", "--multirun"]
+    assert as_multirun(["-m", "sweep=seeds"]) == ["-m", "sweep=seeds"]
+    assert as_multirun(["seed=1"]) == ["seed=1"]
