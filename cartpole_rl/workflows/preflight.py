@@ -1,7 +1,5 @@
 """Check a cart by small moves before an agent drives it."""
 
-import shlex
-from collections.abc import Sequence
 from contextlib import closing
 
 from cartpole_rl.errors import PlantError
@@ -11,16 +9,16 @@ from cartpole_rl.plants.serial.preparation import FaultClearing, always, asking
 from cartpole_rl.plants.settings import BoardSettings, emulated_pole
 from cartpole_rl.randomization.poles import Pole, one_pole
 from cartpole_rl.rig.hardware import nominal_hardware
-from cartpole_rl.terminal import confirm
+from cartpole_rl.terminal import confirm, words_given
 from cartpole_rl.workflows.config import PreflightConfig
 from cartpole_rl.workflows.poles import PRETRAINED, emulator_for, plant_words
 
 
-def check_cart(config: PreflightConfig, words: Sequence[str] = ()) -> None:
+def check_cart(config: PreflightConfig) -> None:
     """Check the cart of `config.plant` by small moves, and print a line for each check.
 
-    At the end prints the next command, with the cart's file that `words` of the command line give. Writes no
-    files. Raises PlantError after the first check that fails, LinkError if no cart answers.
+    At the end prints the next command. Writes no files. Raises PlantError after the first check that fails,
+    LinkError if no cart answers.
     """
     plant, hardware = config.plant, config.hardware
     faults = FaultClearing(plant.clear_faults, confirm if plant.can_be_damaged else always)
@@ -39,10 +37,10 @@ def check_cart(config: PreflightConfig, words: Sequence[str] = ()) -> None:
         print("The cart is ready. Next, hold the pole up when asked (pretrained/large is for one of 0.66 m):")
     else:
         print("The cart is ready. Next, measure it; pretrained agents are for carts like cart=ip02:")
-    print(next_command(config, words))
+    print(next_command(config))
 
 
-def next_command(config: PreflightConfig, words: Sequence[str] = ()) -> str:
+def next_command(config: PreflightConfig) -> str:
     """Return the command that balances the pole on the same cart, with an agent for its length.
 
     A cart that is not like ip02, which no pretrained agent knows, is identified first.
@@ -51,8 +49,7 @@ def next_command(config: PreflightConfig, words: Sequence[str] = ()) -> str:
     if config.hardware == nominal_hardware():
         pole = pole if pole in PRETRAINED else PRETRAINED[0]
         return f"cartpole-evaluate run=pretrained/{pole} task=balance {plant} episodes=1"
-    cart = [shlex.quote(word) for word in words if word.startswith(("cart=", "cart."))]
-    return " ".join(["cartpole-identify", *cart, plant, f"pole={pole or '<yours>.yaml'}"])
+    return " ".join(["cartpole-identify", *words_given("cart"), plant, f"pole={pole or '<yours>.yaml'}"])
 
 
 def mounted_pole(config: PreflightConfig) -> str:

@@ -1,7 +1,6 @@
 """Train an agent in randomized simulation, from settings to a run folder."""
 
 import math
-import sys
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
@@ -30,9 +29,9 @@ from cartpole_rl.reporting.web_view import WebView
 from cartpole_rl.run_folder import BEST, CHECKPOINTS, FIGURES, METRICS, file_hash, write_config
 from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.terminal import as_word, print_message, print_results, shown, waiting
+from cartpole_rl.terminal import as_word, print_message, print_results, shown, waiting, words_given
 from cartpole_rl.workflows.build import new_agent, use_threads
-from cartpole_rl.workflows.checks import check_compiler, check_resumable, is_given, note_other_numbers
+from cartpole_rl.workflows.checks import check_compiler, check_resumable, note_other_numbers
 from cartpole_rl.workflows.config import TrainConfig, recorded_settings
 from cartpole_rl.workflows.monitor import TrainingMonitor
 from cartpole_rl.workflows.poles import emulated_words, words_of_run
@@ -155,7 +154,7 @@ def print_notes(config: TrainConfig, draws: Draws, models: Models) -> None:
         note_other_numbers("train", config.nominal_cart, (config.pole.choices or {}).values())
         note_blocked_track(config)
         note_other_carts(config, draws)
-    elif given := [word for word in sys.argv[1:] if is_given(OF_CARTS, [word]) and word[:5] != "cart="]:
+    elif given := [word for word in words_given(*OF_CARTS) if not word.strip("'").startswith("cart=")]:
         print_message(
             "train",
             f"note: {', '.join(given)}: plant={config.plant.kind} has its own cart and friction; only carts "

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 import yaml
 from command_line import ONCE, TINY, Outcome, in_process
 
@@ -18,6 +17,7 @@ from cartpole_rl.evaluation.recordings import read_recording, write_recording
 from cartpole_rl.plants.learned import load_model, save_model
 from cartpole_rl.run_folder import experiments
 from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.terminal import noting
 from cartpole_rl.workflows.config import TrainConfig, load_settings
 from cartpole_rl.workflows.model import next_command
 from cartpole_rl.workflows.train import print_notes
@@ -137,13 +137,13 @@ def test_an_agent_is_trained_on_it_and_judged_on_it(learned: tuple[Path, Outcome
 
 
 def test_the_notes_and_the_preview_are_about_its_carts(
-    learned: tuple[Path, Outcome], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Any
+    learned: tuple[Path, Outcome], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def notes(**settings: Any) -> str:
         given = {"plant": "learned", "plant.model": str(learned[0]), **settings}
-        monkeypatch.setattr("sys.argv", ["", *(f"{name}={value}" for name, value in given.items())])
         config = load_settings(TrainConfig, given)
-        print_notes(config, *driven_carts(config, config.plant))
+        with noting([f"{name}={value}" for name, value in given.items()]):
+            print_notes(config, *driven_carts(config, config.plant))
         return capsys.readouterr().err
 
     other = {"step": "sigmoid", "sigmoid": "step"}[report(learned[0])["cart_friction"]]
@@ -191,19 +191,13 @@ def test_a_model_that_does_not_fit_is_refused(learned: tuple[Path, Outcome], tmp
 
 def test_a_missing_or_damaged_model_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "damaged.pt").write_bytes(b"not a model")
-    torch.save({"format": "cartpole_rl agent 1"}, tmp_path / "agent.pt")
-    for source, complaint in {
-        "nowhere": "nowhere: there is no such file or folder; give a run of cartpole-model",
-        ".": ".: it holds no model.pt; give a run of cartpole-model",
-        "damaged.pt": "damaged.pt is not a learned model, or is damaged",
-        "agent.pt": "agent.pt is not a learned model: its format is 'cartpole_rl agent 1'",
-    }.items():
-        done = in_process("train", "plant=learned", f"plant.model={source}", *TINY, folder=tmp_path)
-        assert done.complaint.startswith(f"cartpole-train: plant.model={complaint}")
-        assert done.code == 1
-    done = in_process("train", "plant=learned", *TINY, folder=tmp_path)
-    assert done.complaint == "cartpole-train: plant.model is missing; give plant.model=runs/model/<run>"
-    assert done.code == 2
+    for given, complaint, code in (
+        ("plant.model=damaged.pt", "plant.model=damaged.pt is not a learned model, or is damaged", 1),
+        ("label=", "plant.model is missing; give plant.model=runs/model/<run>", 2),
+    ):
+        done = in_process("train", "plant=learned", given, *TINY, folder=tmp_path)
+        assert done.complaint.startswith(f"cartpole-train: {complaint}")
+        assert done.code == code
 
 
 def test_too_short_a_recording_says_so(recorded: Path, tmp_path: Path) -> None:

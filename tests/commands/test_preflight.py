@@ -9,6 +9,7 @@ from command_line import in_process
 
 from cartpole_rl.checking import validated
 from cartpole_rl.composition import compose, reading_conf
+from cartpole_rl.terminal import noting
 from cartpole_rl.workflows.config import PreflightConfig
 from cartpole_rl.workflows.preflight import next_command
 
@@ -62,7 +63,8 @@ def test_the_next_command_is_for_the_same_cart(given: tuple[str, ...], following
 
 def test_the_file_of_another_cart_is_quoted_in_the_next_command() -> None:
     config = validated(PreflightConfig, compose("preflight", {"cart": "stepper", "plant.port": "x"}))
-    following = next_command(config, ["cart=my cart.yaml", "plant.port=x"])
+    with noting(["cart=my cart.yaml", "plant.port=x"]):
+        following = next_command(config)
     words = ["cart=my cart.yaml", "plant=serial", "plant.port=x", "pole=<yours>.yaml"]
     assert shlex.split(following) == ["cartpole-identify", *words]
 
