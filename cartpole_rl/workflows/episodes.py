@@ -150,9 +150,8 @@ def prepared(config: EvaluateConfig) -> Evaluation:
     simulation = (
         predicting_env(settings, agent.training.plant, config.seed) if config.animation.simulation else None
     )
-    on_board = None
-    if config.drives_on_board:
-        on_board = exported_agent(agent_on_board(config, agent, settings), {})
+    drives = config.drives_on_board
+    on_board = exported_agent(agent_on_board(config, agent, settings), {}) if drives else None
     with on_the_board(config, agent, settings) as equipped:
         env = evaluated_env(settings, equipped, prompt=tqdm.write, confirm=confirm)
     return Evaluation(

@@ -11,7 +11,6 @@ from typing import Any
 
 from cartpole_rl.envs.settings import CartPoleSettings
 from cartpole_rl.evaluation.recordings import LENGTH, stored_origin, write_recording
-from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.reporting.texts import count_text, guard_text
 from cartpole_rl.run_folder import RECORDINGS, write_config
 from cartpole_rl.tasks.episode import Episode
@@ -57,19 +56,14 @@ def agents_settings(evaluation: Evaluation) -> CartPoleSettings:
 def heading(config: EvaluateConfig, settings: CartPoleSettings, episode: Episode) -> dict[str, Any]:
     """Return the heading of a recording: the run, and the simulated cart with its initial state."""
     origin = stored_origin(episode.origin) if episode.origin else {}
+    length = config.plant.known_pole_length(config.emulator)  # stated for a real cart
+    if length is None and settings.pole.is_single:
+        length = settings.pole.nominal.length
     return {
         "plant": config.plant.kind,
         "pole": settings.pole.name,
-        LENGTH: length_to_record(config, settings.pole),
+        LENGTH: "" if length is None else f"{length:.4f}",
         "control_period_s": settings.control_period,
         "run": config.run,
         **{name: json.dumps(values) for name, values in origin.items()},
     }
-
-
-def length_to_record(config: EvaluateConfig, poles: PoleSettings) -> str:
-    """Return the pole's length in m, as stated for a real cart or that of `poles`; empty for several."""
-    length = config.plant.known_pole_length(config.emulator)
-    if length is None and poles.is_single:
-        length = poles.nominal.length
-    return "" if length is None else f"{length:.4f}"

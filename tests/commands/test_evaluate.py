@@ -40,7 +40,10 @@ def guard_of(run: Path) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def evaluated(trained: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with evaluations: `wide` of drawn carts, `noisy` where much is left to chance."""
+    """A folder with evaluations: `wide` of drawn carts, `noisy` where much is left to chance.
+
+    `older` is `wide` without its carts, `damaged` has half a metrics.json.
+    """
     folder = tmp_path_factory.mktemp("evaluated")
     noisy = "parameters={latency:0.01,latency_jitter:0.002,angle_noise:0.002}"
     emulated = ("plant=emulated", "episodes=1", "animation.simulation=true")
@@ -49,6 +52,13 @@ def evaluated(trained: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         evaluate(trained, folder, "wide", *wide)
         evaluate(trained, folder, "noisy", noisy, "task=swingup", "episodes=3")
     evaluate(trained, folder, "emulated", *emulated)
+    for name in ("older", "damaged"):
+        shutil.copytree(folder / "wide", folder / name)
+    metrics = read(folder / "wide")
+    for each in (metrics, *metrics["episodes"]):
+        del each["cart"]
+    (folder / "older/metrics.json").write_text(json.dumps(metrics))
+    (folder / "damaged/metrics.json").write_text('{"plant": "simu')
     return folder
 
 
@@ -170,16 +180,6 @@ def test_numbers_come_back_to_the_bit() -> None:
 def test_bad_input_is_told_in_a_line(
     words: str, named: str, remedy: str, trained: Path, evaluated: Path
 ) -> None:
-    for name in ("older", "damaged"):
-        (evaluated / name).mkdir(exist_ok=True)
-        config = yaml.safe_load((evaluated / "wide/config.yaml").read_text())
-        (evaluated / name / "config.yaml").write_text(yaml.safe_dump(config))
-    metrics = read(evaluated / "wide")
-    for episode in metrics["episodes"]:
-        del episode["cart"], episode["start"]
-    del metrics["cart"]
-    (evaluated / "older/metrics.json").write_text(json.dumps(metrics))
-    (evaluated / "damaged/metrics.json").write_text('{"plant": "simu')
     done = in_process("evaluate", f"run={trained}", *words.split(), folder=evaluated)
     assert done.code in (1, 2)
     assert named in done.complaint
