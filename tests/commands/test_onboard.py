@@ -80,7 +80,6 @@ def test_a_board_without_the_agent_is_refused_before_it_moves(
         ),
         ("record", BOARD, "emulator.policy=onboard", "leave it out"),
         ("finetune", BOARD, "emulator.policy=onboard", "leave it out"),
-        ("preflight", BOARD, "emulator.policy=onboard", "leave it out"),
         ("preflight", SERIAL, "plant.policy", "leave it out"),
         ("evaluate", (*BOARD, "repeat.run=x", "repeat.episode=0"), "repeat", "leave out repeat.*"),
         ("evaluate", (*SERIAL, "guard=none"), "guard", "leave out guard"),

@@ -145,46 +145,42 @@ class Script:
 
 
 @pytest.fixture
-def log(tmp_path: Path) -> Iterator[TensorBoardLog]:
-    with TensorBoardLog(tmp_path) as opened:
-        yield opened
+def cart(files: FinetuningFiles) -> Iterator[FinetuningCart]:
+    with TensorBoardLog(files.folder) as log:
+        yield FinetuningCart(Script(), files, log, "score")
 
 
 def test_an_evaluation_that_the_link_ended_is_driven_again(
-    files: FinetuningFiles, log: TensorBoardLog, capsys: pytest.CaptureFixture[str]
+    cart: FinetuningCart, files: FinetuningFiles, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    script = Script("time", "link", "encoder", "fault", "late", "link", "link")
-    cart = FinetuningCart(script, files, log, "score")
+    cart.driver = Script("time", "link", "encoder", "fault", "late", "link", "link")
     with pytest.raises(LinkError, match=r"before 3: the link was lost after 0\.0 s, 3 times in succession"):
         cart.evaluate(Stage.BEFORE, {})
     assert [each.ended_by for each in files.episodes(Stage.BEFORE)] == ["time", "fault"]
     told = "before 2: the link was lost after 0.0 s; the episode does not count and is driven again"
     assert capsys.readouterr().out.splitlines()[1] == told
-    cart = FinetuningCart(Script("link", "late"), files, log, "score")
+    cart.driver = Script("link", "late")
     cart.start_tuning(0, {})
     cart.finish(Stage.TUNE, 0)  # one to learn from counts until then, unless it is too short
     assert files.episode(Stage.TUNE, 0).time[-1] == 2.0
 
 
 def test_an_episode_is_scored_as_its_task_is(
-    files: FinetuningFiles, log: TensorBoardLog, capsys: pytest.CaptureFixture[str]
+    cart: FinetuningCart, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    FinetuningCart(Script(), files, log, "score_upright").keep(
-        Stage.BEFORE, 0, replace(EPISODE, score_upright=np.array([3.0, 4.0])), LinkStatistics()
-    )
+    cart.measure = "score_upright"
+    scored = replace(EPISODE, score_upright=np.array([3.0, 4.0]))
+    cart.keep(Stage.BEFORE, 0, scored, LinkStatistics())
     assert capsys.readouterr().out == "before 1: score_upright 7, ended by time\n"
-    assert scalars(files.folder, "cart/score_before") == [(1, 7.0)]
+    assert scalars(cart.files.folder, "cart/score_before") == [(1, 7.0)]
 
 
 @pytest.mark.parametrize("stage", [Stage.BEFORE, Stage.TUNE])
-def test_an_episode_without_a_measured_period_is_driven_again(
-    stage: Stage, files: FinetuningFiles, log: TensorBoardLog
-) -> None:
-    script = Script("empty", "empty", "fault", "empty", "empty", "empty")
-    cart = FinetuningCart(script, files, log, "score")
+def test_an_episode_without_a_measured_period_is_driven_again(stage: Stage, cart: FinetuningCart) -> None:
+    cart.driver = Script("empty", "empty", "fault", "empty", "empty", "empty")
     cart.start({}, 0.0, 0)
     cart.finish(stage, 0)
-    assert [each.steps for each in files.episodes(stage)] == [2]
+    assert [each.steps for each in cart.files.episodes(stage)] == [2]
     with pytest.raises(LinkError, match=r"2: the cart reported a fault after 0\.0 s, 3 times in succession"):
         cart.finish(stage, 1)
 
