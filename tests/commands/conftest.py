@@ -1,4 +1,4 @@
-"""Runs that several test files share: trainings, recordings, an identification, a fine-tuning.
+"""Runs that several test files share: two trainings (one interrupted), an identification, a fine-tuning.
 
 One worker of the tests makes each; every worker has a copy of its own.
 """
@@ -77,18 +77,6 @@ def stopped(interrupted: tuple[Path, Outcome]) -> Path:
     folder, done = interrupted
     assert done.code == 130, done.err
     return folder
-
-
-@pytest.fixture(scope="session")
-def recorded(once: Make) -> Path:
-    """The run folder of two recorded episodes of the nominal cart."""
-
-    def make(folder: Path) -> Outcome:
-        done = in_process("record", "run=lqr", "episodes=2", "hydra.run.dir=run", folder=folder)
-        assert done.code == 0, done.err
-        return done
-
-    return once("recorded", make)[0]
 
 
 @pytest.fixture(scope="session")

@@ -56,7 +56,7 @@ def test_a_refused_export_leaves_no_run(tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with two short recordings of an agent, in `rec`."""
     folder = tmp_path_factory.mktemp("recorded")
     words = ("run=pretrained/large", "episodes=2", "task=swingup", "task.time_limit=30", "hydra.run.dir=rec")
@@ -65,17 +65,17 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("form", ["minari", "mcap"])
-def test_recordings_come_back_to_the_bit(form: str, exported: Path) -> None:
+def test_recordings_come_back_to_the_bit(form: str, recorded: Path) -> None:
     pytest.importorskip(form, reason=f'{form} is missing: pip install "cartpole_rl[{form}]"')
     back = f"back_{form}"
-    done = in_process("export", f"format={form}", "from=rec", f"hydra.run.dir={form}", folder=exported)
+    done = in_process("export", f"format={form}", "from=rec", f"hydra.run.dir={form}", folder=recorded)
     assert done.code == 0, done.err
     assert "2 " in done.out
-    done = in_process("import", f"from={form}", f"hydra.run.dir={back}", folder=exported)
+    done = in_process("import", f"from={form}", f"hydra.run.dir={back}", folder=recorded)
     assert done.code == 0, done.err
     assert done.out.splitlines()[-1] == f"cartpole-replay from={back}"
-    before = sorted((exported / "rec/recordings").iterdir())
-    after = sorted((exported / back / "recordings").iterdir())
+    before = sorted((recorded / "rec/recordings").iterdir())
+    after = sorted((recorded / back / "recordings").iterdir())
     assert [path.name for path in after] == ["episode_000.csv", "episode_001.csv"]
     assert [path.read_bytes() for path in after] == [path.read_bytes() for path in before]
     assert recorded_cart(after) == recorded_cart(before) is not None
@@ -90,14 +90,14 @@ def test_the_cart_of_an_unfinished_fine_tuning_is_that_of_its_first_agent(tmp_pa
     assert cart.pole.name == "medium"
 
 
-def test_a_data_set_is_found_by_its_name(exported: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_data_set_is_found_by_its_name(recorded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("minari", reason='minari is missing: pip install "cartpole_rl[minari]"')
     words = ("format=minari", "from=rec", "label=a-b", "hydra.run.dir=named")
-    assert in_process("export", *words, folder=exported).code == 0
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(exported / "named"))
+    assert in_process("export", *words, folder=recorded).code == 0
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(recorded / "named"))
     words = ("from=cartpole_rl/a_b-v0", "hydra.run.dir=found")
-    assert in_process("import", *words, folder=exported).code == 0
-    assert len([*exported.glob("found/recordings/*.csv")]) == 2
+    assert in_process("import", *words, folder=recorded).code == 0
+    assert len([*recorded.glob("found/recordings/*.csv")]) == 2
 
 
 def test_what_an_import_cannot_use_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

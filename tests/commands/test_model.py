@@ -32,6 +32,16 @@ SMALL = (
 
 
 @pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run folder of two short recorded episodes of a simulated cart."""
+    folder = tmp_path_factory.mktemp("recorded")
+    shorter = ["task=swingup", "task.time_limit=400"]
+    done = in_process("record", "run=lqr", "episodes=2", *shorter, "hydra.run.dir=run", folder=folder)
+    assert done.code == 0, done.err
+    return folder / "run"
+
+
+@pytest.fixture(scope="module")
 def learned(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Outcome]:
     """The run folder of a small ensemble, and what was printed."""
     folder = tmp_path_factory.mktemp("model")

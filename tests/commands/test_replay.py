@@ -10,6 +10,15 @@ import yaml
 from command_line import Outcome, in_process
 
 
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run folder of two recorded episodes of the nominal cart."""
+    folder = tmp_path_factory.mktemp("recorded")
+    done = in_process("record", "run=lqr", "episodes=2", "hydra.run.dir=run", folder=folder)
+    assert done.code == 0, done.err
+    return folder / "run"
+
+
 def replay(source: Path, folder: Path, *words: str) -> tuple[Outcome, dict[str, Any]]:
     done = in_process("replay", f"from={source}", *words, "hydra.run.dir=run", folder=folder)
     assert done.code == 0, done.err
