@@ -5,6 +5,7 @@ Tests that drive in real time, 10 ms a period, are nightly: they need a machine 
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -16,17 +17,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
-from tensordict import TensorDict
 
 from cartpole_rl.choices import choice
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import ConfigError, LinkError, PlantError
 from cartpole_rl.plants.emulated import BridgeProcess
 from cartpole_rl.plants.serial.plant import SerialPlant, cart_on_port
-from cartpole_rl.plants.serial.preparation import always, nobody
+from cartpole_rl.plants.serial.preparation import Confirm, always, nobody
 from cartpole_rl.plants.settings import DriverSettings, TextSettings
-from cartpole_rl.rig.hardware import Hardware, hardware_of
+from cartpole_rl.rig.hardware import hardware_of
 
 BOARD = Path(__file__).parents[2] / "support" / "text_board.py"
 CART = choice("cart/stepper")
@@ -53,13 +52,19 @@ def board(**options: Any) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
         process.stdout.close()
 
 
-def driven(port: str, period: float = 0.01, hardware: Hardware = RIG, **changed: Any) -> SerialPlant:
+def driven(port: str, period: float = 0.01, confirm: Confirm = always, **changed: Any) -> SerialPlant:
     settings = TextSettings(**STEPPER | {"port": port} | changed)
-    return cart_on_port(settings, EmulatorSettings(), period, "hanging", print, always, hardware.model_dump())
+    return cart_on_port(settings, EmulatorSettings(), period, "hanging", print, confirm, RIG.model_dump())
 
 
-def push(plant: SerialPlant, motor: int) -> TensorDict:
-    return plant.step(TensorDict({"motor": torch.full((1, 1), motor)}, [1]))["next"]
+@contextmanager
+def driven_board(
+    journal: Path | str = os.devnull, period: float = 0.01, **changed: Any
+) -> Iterator[SerialPlant]:
+    """A running board, and the plant on it. The options of the board are `board`."""
+    options = {"journal": str(journal), **changed.pop("board", {})}
+    with board(**options) as (port, _), closing(driven(port, period, **changed)) as plant:
+        yield plant
 
 
 def taken(journal: Path) -> list[tuple[float, str, float]]:
@@ -79,16 +84,15 @@ def last_speed(journal: Path) -> float:
 
 @pytest.mark.nightly
 def test_it_is_driven_and_left_standing(tmp_path: Path) -> None:
-    with board(journal=str(tmp_path / "journal")) as (port, _), closing(driven(port)) as plant:
-        first = plant.reset()
-        assert first["counts"].tolist() == [[0, 2048]]
+    with driven_board(tmp_path / "journal") as plant:
+        assert plant.reset_one().counts == (0, 2048)
         for _ in range(30):
-            frame = push(plant, 60)
-        cart, pole = frame["counts"][0].tolist()
+            frame = plant.step_one(60)
+        cart, pole = frame.counts
         assert cart * 25e-6 == pytest.approx(0.10, abs=0.03)  # 2.8 m/s^2 for 0.3 s, with damping
         assert pole > 2048  # its tip stays behind
-        assert not frame["done"]
-        assert frame["dt"].item() == pytest.approx(0.01, abs=1e-4)
+        assert not frame.ends
+        assert frame.dt == pytest.approx((0.01,), abs=1e-4)
         plant.close()
         lines = taken(tmp_path / "journal")
         assert any(line == "a=2.824" for _, line, _ in lines)
@@ -97,49 +101,43 @@ def test_it_is_driven_and_left_standing(tmp_path: Path) -> None:
 
 @pytest.mark.nightly
 def test_the_end_of_the_track_is_not_touched(tmp_path: Path) -> None:
-    with board(journal=str(tmp_path / "journal")) as (port, _), closing(driven(port)) as plant:
-        plant.reset()
+    with driven_board(tmp_path / "journal") as plant:
+        plant.reset_one()
         for _ in range(300):
-            if push(plant, -255)["done"]:
+            if plant.step_one(-255).ends:
                 break
         assert plant.ended_by == "track"
-        plant.reset()
+        plant.reset_one()
         assert abs(plant.cart.poll_state().cart_counts) < 100
-        positions = [
-            line.split("x=")[1].split()[0] for line in (tmp_path / "journal").read_text().splitlines()
-        ]
+        positions = re.findall(r"x=(\S+)", (tmp_path / "journal").read_text())
         assert max(abs(float(x)) for x in positions) < 0.3
 
 
 @pytest.mark.nightly
 def test_a_board_that_homes_by_itself(tmp_path: Path) -> None:
-    with (
-        board(journal=str(tmp_path / "journal")) as (port, _),
-        closing(driven(port, homing="board", home_line="home")) as plant,
-    ):
-        assert plant.reset()["counts"].tolist() == [[0, 2048]]
-        assert taken(tmp_path / "journal")[0][1] in ("home", "a=-0.000", "a=0.000")
-        assert [line for _, line, _ in taken(tmp_path / "journal")].count("home") == 1
+    with driven_board(tmp_path / "journal", homing="board", home_line="home") as plant:
+        assert plant.reset_one().counts == (0, 2048)
+        lines = [line for _, line, _ in taken(tmp_path / "journal")]
+        assert lines[0] in ("home", "a=-0.000", "a=0.000")
+        assert lines.count("home") == 1
 
 
 @pytest.mark.nightly
 def test_reversed_signs(tmp_path: Path) -> None:
     """The same motion, as seen from the other side."""
-    with board() as (port, _):
-        changed = {"cart_reversed": True, "pole_reversed": True, "full": -12.0}
-        with closing(driven(port, **changed)) as plant:
-            plant.reset()
-            for _ in range(20):
-                frame = push(plant, 60)
-            assert frame["counts"][0, 0] > 0
-            assert frame["counts"][0, 1] > 2048
+    with driven_board(cart_reversed=True, pole_reversed=True, full=-12.0) as plant:
+        plant.reset_one()
+        for _ in range(20):
+            frame = plant.step_one(60)
+        assert frame.counts[0] > 0
+        assert frame.counts[1] > 2048
 
 
 @pytest.mark.nightly
 def test_every_second_line_is_a_period() -> None:
-    with board() as (port, _), closing(driven(port, 0.02)) as plant:
-        plant.reset()
-        assert push(plant, 0)["dt"].item() == pytest.approx(0.02, abs=1e-4)
+    with driven_board(period=0.02) as plant:
+        plant.reset_one()
+        assert plant.step_one(0).dt == pytest.approx((0.02,), abs=1e-4)
 
 
 def test_an_impossible_period_is_refused_before_anything_moves(tmp_path: Path) -> None:
@@ -150,27 +148,17 @@ def test_an_impossible_period_is_refused_before_anything_moves(tmp_path: Path) -
 
 
 def test_a_cart_that_is_put_in_place_by_hand_needs_a_person() -> None:
-    with board() as (port, _):
-        settings = TextSettings(**STEPPER, port=port)
-        with (
-            closing(
-                cart_on_port(settings, EmulatorSettings(), 0.01, "hanging", print, nobody, RIG.model_dump())
-            ) as plant,
-            pytest.raises(
-                PlantError, match=r"plant\.homing=hand: a person has to put the cart in the middle"
-            ),
-        ):
-            plant.reset()
+    words = r"plant\.homing=hand: a person has to put the cart in the middle"
+    with driven_board(confirm=nobody) as plant, pytest.raises(PlantError, match=words):
+        plant.reset_one()
 
 
 @pytest.mark.nightly
 def test_damaged_lines_are_dropped() -> None:
     """A tenth of all lines: nothing jumps, nothing ends."""
-    with board(garbage=0.1) as (port, _), closing(driven(port)) as plant:
-        plant.reset()
-        counts = [
-            push(plant, 40 if period % 40 < 20 else -40)["counts"][0, 0].item() for period in range(120)
-        ]
+    with driven_board(board={"garbage": 0.1}) as plant:
+        plant.reset_one()
+        counts = [plant.step_one(40 if period % 40 < 20 else -40).counts[0] for period in range(120)]
         assert not plant.ended_by
         assert max(abs(after - before) for before, after in pairwise(counts)) < 1500
 
@@ -192,18 +180,18 @@ FAILURES = {
 def test_a_board_that_fails_is_stopped(options: dict[str, Any], why: str, tmp_path: Path) -> None:
     journal = tmp_path / "journal"
     with board(journal=str(journal), at=5, **options) as (port, process), closing(driven(port)) as plant:
-        plant.reset()
+        plant.reset_one()
         deadline = time.monotonic() + 20
         for period in count():
-            if (frame := push(plant, 20 if period % 40 < 20 else -20))["done"]:
+            if (frame := plant.step_one(20 if period % 40 < 20 else -20)).ends:
                 break
             if not options:
                 process.kill()
             assert time.monotonic() < deadline
-        assert frame["truncated"]
+        assert frame.truncated[0]
         assert plant.ended_by == "link"
         with pytest.raises(LinkError, match=why):
-            plant.reset()
+            plant.reset_one()
         if options:
             assert abs(last_speed(journal)) < 0.02  # by what was sent: no measurement tells
             assert float(taken(journal)[-1][1].removeprefix("a=")) == 0
@@ -212,12 +200,12 @@ def test_a_board_that_fails_is_stopped(options: dict[str, Any], why: str, tmp_pa
 @pytest.mark.nightly
 def test_a_frozen_counter_latches_a_fault(tmp_path: Path) -> None:
     journal = tmp_path / "journal"
-    with board(journal=str(journal), at=4, freeze="both") as (port, _), closing(driven(port)) as plant:
-        plant.reset()
+    with driven_board(journal, board={"at": 4, "freeze": "both"}) as plant:
+        plant.reset_one()
         for period in range(1500):
-            if (frame := push(plant, 70 if period % 60 < 30 else -70))["done"]:
+            if (frame := plant.step_one(70 if period % 60 < 30 else -70)).ends:
                 break
-        assert frame["truncated"]
+        assert frame.truncated[0]
         assert plant.ended_by == "fault"
         assert abs(last_speed(journal)) < 0.1
         assert float(taken(journal)[-1][1].removeprefix("a=")) == 0
@@ -280,10 +268,10 @@ def test_a_command_that_is_killed_leaves_the_cart_standing(tmp_path: Path) -> No
     journal = tmp_path / "journal"
     with board(journal=str(journal)) as (port, _):
         program = (
-            "import sys, torch; sys.path[:0] = sys.argv[2:]\n"
-            "from test_bridge import driven, push\n"
-            "plant = driven(sys.argv[1]); plant.reset(); print('driving', flush=True)\n"
-            "while True: push(plant, 30)\n"
+            "import sys; sys.path[:0] = sys.argv[2:]\n"
+            "from test_bridge import driven\n"
+            "plant = driven(sys.argv[1]); plant.reset_one(); print('driving', flush=True)\n"
+            "while True: plant.step_one(30)\n"
         )
         command = [sys.executable, "-c", program, port, str(Path(__file__).parent), str(BOARD.parent)]
         with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
@@ -293,4 +281,4 @@ def test_a_command_that_is_killed_leaves_the_cart_standing(tmp_path: Path) -> No
             os.kill(process.pid, signal.SIGKILL)
         assert abs(last_speed(journal)) < 0.02
         with closing(driven(port)) as plant:  # the port was given back
-            plant.reset()
+            plant.reset_one()

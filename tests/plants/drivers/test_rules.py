@@ -5,7 +5,7 @@ import re
 import signal
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from threading import Event
 from typing import Any
 
@@ -100,11 +100,24 @@ class Playing(Bridge):
             taken.append(self.played.bad == before)
         return taken
 
+    def run_and_end(self) -> None:
+        """Run until something is raised, and end."""
+        with self:
+            self.run(Frames())  # type: ignore[arg-type]
+
     def drive(self, motor: int, monkeypatch: pytest.MonkeyPatch) -> None:
         """Let the rules ask for a motor value, whatever is measured; 0 for a late host."""
         self._stand_in.armed = self._stand_in.homed = True
         monkeypatch.setattr(StandIn, "motor", motor)
         monkeypatch.setattr(StandIn, "is_idle", lambda stand_in, now_us: motor == 0)
+
+    def home(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Let the rules home the cart, which is not armed any more, with the motor value 0."""
+        self._stand_in.armed = False
+        monkeypatch.setattr(StandIn, "motor", 0)
+        monkeypatch.setattr(StandIn, "homing", True)
+        monkeypatch.setattr(StandIn, "is_idle", lambda stand_in, now_us: False)
+        monkeypatch.setattr(StandIn, "tick", lambda *arguments: [])
 
 
 def test_a_brake_ends_when_the_board_falls_silent(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -205,11 +218,7 @@ def test_a_stepper_that_rolls_is_slowed_down_when_its_homing_begins(
     bridge.measure(*range(0, 4000, 400))  # 1 m/s
     bridge.drive(255, monkeypatch)
     bridge.measure(*range(4000, 16_000, 400))
-    bridge._stand_in.armed = False
-    monkeypatch.setattr(StandIn, "motor", 0)
-    monkeypatch.setattr(StandIn, "homing", True)
-    monkeypatch.setattr(StandIn, "is_idle", lambda stand_in, now_us: False)
-    monkeypatch.setattr(StandIn, "tick", lambda *arguments: [])
+    bridge.home(monkeypatch)
     before = bridge.played.sent[-1]
     bridge.measure(16_000)
     assert bridge.played.sent[-1] == (pytest.approx(before - 0.04) if sends == "speed" else -4)
@@ -225,11 +234,8 @@ def test_homing_begins_at_rest_whatever_speed_was_sent_before(
     bridge.drive(255, monkeypatch)
     bridge.measure(*[0] * 30)
     assert bridge.played.sent[-1] > 0.9
-    monkeypatch.setattr(StandIn, "motor", 0)
-    monkeypatch.setattr(StandIn, "homing", True)
-    monkeypatch.setattr(StandIn, "is_idle", lambda stand_in, now_us: False)
-    monkeypatch.setattr(StandIn, "tick", lambda *arguments: [])
-    bridge._stand_in.armed, bridge._stand_in.board_homes = False, board_homes
+    bridge.home(monkeypatch)
+    bridge._stand_in.board_homes = board_homes
     bridge.measure(*[0] * 40)
     bridge._stand_in.board_homes = False
     bridge.measure(0)
@@ -420,9 +426,9 @@ def test_no_command_is_infinite() -> None:
         bridge._send_value(math.nan)
 
 
-@pytest.fixture
-def same_signals() -> Iterator[None]:
-    """Give signals their handlers back."""
+@pytest.fixture(autouse=True)
+def _same_signals() -> Iterator[None]:
+    """Give signals their handlers back, which the end of a bridge replaces."""
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     before = [signal.getsignal(number) for number in numbers]
     yield
@@ -430,24 +436,30 @@ def same_signals() -> Iterator[None]:
         signal.signal(number, handler)
 
 
-@pytest.mark.usefixtures("same_signals")
 def test_a_driver_that_raises_anything_leaves_a_stopped_board() -> None:
     bridge = Playing(sends="acceleration", full=12.0)
     bridge.played.script = [Measurement(0, 0, 0), ValueError("oops"), ValueError("again")]
-    with pytest.raises(LinkError, match=r"plant\.driver=.*:TextDriver failed: ValueError: oops"), bridge:
-        bridge.run(Frames())  # type: ignore[arg-type]
+    with pytest.raises(LinkError, match=r"plant\.driver=.*:TextDriver failed: ValueError: oops"):
+        bridge.run_and_end()
     assert bridge.played.stops >= STOPS
 
 
-@pytest.mark.usefixtures("same_signals")
 def test_a_driver_that_returns_something_else_is_named() -> None:
     bridge = Playing()
     bridge.played.script = [(0, 0, 0)]
-    with bridge, pytest.raises(LinkError, match=r":TextDriver: read returned \(0, 0, 0\); return a Measur"):
-        bridge.run(Frames())  # type: ignore[arg-type]
+    with pytest.raises(LinkError, match=r":TextDriver: read returned \(0, 0, 0\); return a Measur"):
+        bridge.run_and_end()
 
 
-@pytest.mark.usefixtures("same_signals")
+def hanging(until: Event) -> Callable[[float], None]:
+    """Return a call of a driver that does not return before the board is stopped."""
+
+    def hang(argument: float) -> None:
+        raise LinkError("stopped" if until.wait(30) else "still on")
+
+    return hang
+
+
 def test_a_read_that_does_not_return_leaves_no_motor_on(monkeypatch: pytest.MonkeyPatch) -> None:
     bridge, stopped = Playing(), Event()
     bridge.measure(0, 0)
@@ -455,17 +467,12 @@ def test_a_read_that_does_not_return_leaves_no_motor_on(monkeypatch: pytest.Monk
     bridge._stand_in._line.hold(200)
     monkeypatch.setattr(bridge, "_now_us", lambda: Bridge._now_us(bridge))
     monkeypatch.setattr(bridge.played, "stop", stopped.set)
-
-    def hang(timeout: float) -> None:
-        raise LinkError("stopped" if stopped.wait(10) else "still on")
-
-    monkeypatch.setattr(bridge.played, "read", hang)
-    with pytest.raises(LinkError, match=r"^stopped$"), bridge:
-        bridge.run(Frames())  # type: ignore[arg-type]
+    monkeypatch.setattr(bridge.played, "read", hanging(stopped))
+    with pytest.raises(LinkError, match=r"^stopped$"):
+        bridge.run_and_end()
     assert bridge._stand_in.motor == 0
 
 
-@pytest.mark.usefixtures("same_signals")
 @pytest.mark.parametrize("hangs", ["read", "send"])
 def test_stopping_a_board_goes_on_while_the_reading_thread_hangs(
     hangs: str, monkeypatch: pytest.MonkeyPatch
@@ -481,17 +488,13 @@ def test_stopping_a_board_goes_on_while_the_reading_thread_hangs(
             raise OSError("no buffer space, once")
         stopped.set()
 
-    def hang(value: float) -> None:
-        raise LinkError("stopped" if stopped.wait(30) else "still on")
-
     monkeypatch.setattr(bridge.played, "stop", stop)
-    monkeypatch.setattr(bridge.played, hangs, hang)
+    monkeypatch.setattr(bridge.played, hangs, hanging(stopped))
     bridge.played.script = [Measurement(0, 0, 3 * PERIOD_US)]
-    with pytest.raises(LinkError, match=r"^stopped$"), bridge:
-        bridge.run(Frames())  # type: ignore[arg-type]
+    with pytest.raises(LinkError, match=r"^stopped$"):
+        bridge.run_and_end()
 
 
-@pytest.mark.usefixtures("same_signals")
 def test_a_stepper_is_slowed_down_while_the_reading_thread_hangs(monkeypatch: pytest.MonkeyPatch) -> None:
     bridge, stopped, fails = Playing(sends="acceleration", full=12.0, fastest=2.0), Event(), iter([True])
     bridge.measure(*range(0, 4000, 400))  # 1 m/s
@@ -503,46 +506,36 @@ def test_a_stepper_is_slowed_down_while_the_reading_thread_hangs(monkeypatch: py
             raise OSError("no buffer space, once")
         sent.append(value)
 
-    def hang(timeout: float) -> None:
-        raise LinkError("stopped" if stopped.wait(30) else "still on")
-
     monkeypatch.setattr(bridge.played, "send", send)
     monkeypatch.setattr(bridge.played, "stop", stopped.set)
-    monkeypatch.setattr(bridge.played, "read", hang)
-    with pytest.raises(LinkError, match=r"^stopped$"), bridge:
-        bridge.run(Frames())  # type: ignore[arg-type]
+    monkeypatch.setattr(bridge.played, "read", hanging(stopped))
+    with pytest.raises(LinkError, match=r"^stopped$"):
+        bridge.run_and_end()
     assert sent  # it was not stopped at once, which would let it roll
 
 
-@pytest.mark.usefixtures("same_signals")
 def test_a_command_that_does_not_return_keeps_nobody_from_stopping_the_board() -> None:
     bridge = Playing()
     bridge._lock.acquire()  # as the thread that hangs in `send`
-    with bridge, pytest.raises(LinkError, match=r":TextDriver: send, stop or home did not return for 0\.5 s"):
-        bridge.run(Frames())  # type: ignore[arg-type]
+    with pytest.raises(LinkError, match=r":TextDriver: send, stop or home did not return for 0\.5 s"):
+        bridge.run_and_end()
     assert bridge.played.stops == STOPS
 
 
-@pytest.mark.usefixtures("same_signals")
 @pytest.mark.parametrize("why", ["is the cart unplugged?", ""])
 def test_a_board_that_takes_no_stop_at_the_end_is_told(why: str, monkeypatch: pytest.MonkeyPatch) -> None:
     bridge = Playing()
     bridge.played.script = [LinkError(why) if why else KeyboardInterrupt()]
     monkeypatch.setattr(bridge.played, "stop", unable)
-    with (
-        pytest.raises(
-            LinkError, match=rf"{re.escape(why or 'OSError: no bus')}; .* its motor may still be on"
-        ),
-        bridge,
-    ):
-        bridge.run(Frames())  # type: ignore[arg-type]
+    told = re.escape(why or "OSError: no bus")
+    with pytest.raises(LinkError, match=rf"{told}; .* its motor may still be on"):
+        bridge.run_and_end()
 
 
 def unable() -> None:
     raise OSError("no bus")
 
 
-@pytest.mark.usefixtures("same_signals")
 def test_two_signals_at_once_leave_a_stopped_board(monkeypatch: pytest.MonkeyPatch) -> None:
     """A logout sends SIGTERM and SIGHUP; the second one must not interrupt what the first one begins."""
     bridge, both = Playing(), (signal.SIGTERM, signal.SIGHUP)
@@ -554,8 +547,8 @@ def test_two_signals_at_once_leave_a_stopped_board(monkeypatch: pytest.MonkeyPat
         signal.pthread_sigmask(signal.SIG_UNBLOCK, both)
 
     monkeypatch.setattr(bridge.played, "read", session_ends)
-    with until_stopped(), bridge:
-        bridge.run(Frames())  # type: ignore[arg-type]
+    with until_stopped():
+        bridge.run_and_end()
     assert bridge.played.stops == STOPS
 
 
@@ -597,29 +590,21 @@ def test_a_stop_that_the_board_did_not_get_is_not_acknowledged(monkeypatch: pyte
     assert not sent
 
 
-def test_few_measurements_are_counted_in_the_message(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("period_us", "measurements", "why"),
+    [
+        (10, 25, r"x measures every 0\.01 ms by its time; .*correct time_unit"),
+        (10_000_000, 25, r"x measures every 1e\+04 ms by its time; .*correct time_unit"),
+        (PERIOD_US, 19, "only 19 measurements came from x"),
+    ],
+)
+def test_a_board_whose_period_cannot_be_learnt_is_refused(
+    period_us: int, measurements: int, why: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     bridge = Playing(connect_timeout=0.1)
     monkeypatch.setattr("cartpole_rl.plants.drivers.bridge.LISTENED_TO_ARRIVALS", 0.0)
-    bridge.played.script = [Measurement(0, 0, PERIOD_US * number) for number in range(19)]
-    with pytest.raises(LinkError, match="only 19 measurements came from x"):
-        bridge.listen()
-
-
-def test_a_moment_without_a_measurement_is_no_silence() -> None:
-    bridge = Playing()
-    bridge.played.script = [
-        Measurement(0, 0, PERIOD_US * number) if number % 5 else None for number in range(60)
-    ]
-    assert bridge._learn_period() == PERIOD_US
-
-
-@pytest.mark.parametrize(("period_us", "read"), [(10, "0.01"), (10_000_000, "1e+04")])
-def test_a_time_in_another_unit_is_refused(period_us: int, read: str) -> None:
-    bridge = Playing()
-    bridge.played.script = [Measurement(0, 0, period_us * number) for number in range(25)]
-    with pytest.raises(
-        LinkError, match=rf"x measures every {re.escape(read)} ms by its time; .*correct time_unit"
-    ):
+    bridge.played.script = [Measurement(0, 0, period_us * number) for number in range(measurements)]
+    with pytest.raises(LinkError, match=why):
         bridge.listen()
 
 
@@ -640,12 +625,16 @@ def test_the_period_is_learnt_from_coarse_stamps_and_in_spite_of_lost_lines(
     assert bridge._learn_period() == pytest.approx(true_us, rel=0.03)
 
 
-def test_one_damaged_stamp_does_not_hide_the_period_and_a_clock_that_stands_is_refused() -> None:
+def test_neither_a_moment_without_a_measurement_nor_a_damaged_stamp_hides_the_period() -> None:
     bridge = Playing()
-    stamps = [10_000 * number for number in range(25)]
-    stamps[12] = 7_000_000
-    bridge.played.script = [Measurement(0, 0, stamp) for stamp in stamps]
-    assert bridge._learn_period() == 10_000
+    measured = [Measurement(0, 0, PERIOD_US * number) for number in range(60)]
+    measured[12] = Measurement(0, 0, 7_000_000)
+    bridge.played.script = [each if number % 5 else None for number, each in enumerate(measured)]
+    assert bridge._learn_period() == PERIOD_US
+
+
+def test_a_clock_that_stands_is_refused() -> None:
+    bridge = Playing()
     bridge.played.script = [Measurement(0, 0, number // 3) for number in range(25)]
     with pytest.raises(LinkError, match="the time of x does not advance"):
         bridge._learn_period()
@@ -662,20 +651,23 @@ def test_measurements_without_a_time_that_come_in_bursts_are_refused(monkeypatch
         bridge.listen()
 
 
-@pytest.mark.parametrize("position", [0.3, -300.0])
-def test_a_board_is_not_sent_beyond_its_track(position: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    bridge = Playing(homing="board", home_position=position)
+@pytest.mark.parametrize(
+    ("given", "rig", "why"),
+    [
+        ({"homing": "board", "home_position": 0.3}, {}, "home_position=0.3 is beyond the track"),
+        ({"homing": "board", "home_position": -300.0}, {}, "home_position=-300 is beyond the track"),
+        ({"homing": "stops"}, {"left_switch": 1}, "cart= has end switches, which only its board reads; give"),
+    ],
+)
+def test_what_the_board_cannot_do_is_refused_before_anything_is_sent(
+    given: dict[str, Any], rig: dict[str, int], why: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bridge = Playing(**given)
+    bridge._hardware = RIG.model_copy(update=rig)
     monkeypatch.setattr(Played, "home", lambda driver: None)
-    with pytest.raises(ConfigError, match=rf"home_position={position:g} is beyond the track"):
+    with pytest.raises(ConfigError, match=why):
         bridge.listen()
-    assert not bridge.played.sent
-
-
-def test_the_brake_knows_the_pole() -> None:
-    assert Playing()._stand_in._limits._lever == LEVER
-    large = {**choice("cart/ip02"), **choice("pole/large")["choices"]["large"]}
-    assert lever_um(completed(large)) == pytest.approx(81_400, rel=0.01)
-    assert lever_um({**completed(large), "backdrivability": 0.0}) == 0
+    assert (bridge.played.sent, bridge.played.stops) == ([], 0)
 
 
 def test_a_driver_that_cannot_home_is_not_asked_to() -> None:
@@ -683,11 +675,11 @@ def test_a_driver_that_cannot_home_is_not_asked_to() -> None:
         Playing(homing="board").listen()
 
 
-def test_stops_are_not_searched_on_a_cart_with_end_switches() -> None:
-    bridge = Playing(sends="value", damping=0.0, homing="stops")
-    bridge._hardware = RIG.model_copy(update={"left_switch": 1})
-    with pytest.raises(ConfigError, match="cart= has end switches, which only its board reads; give hand"):
-        bridge.listen()
+def test_the_brake_knows_the_pole() -> None:
+    assert Playing()._stand_in._limits._lever == LEVER
+    large = {**choice("cart/ip02"), **choice("pole/large")["choices"]["large"]}
+    assert lever_um(completed(large)) == pytest.approx(81_400, rel=0.01)
+    assert lever_um({**completed(large), "backdrivability": 0.0}) == 0
 
 
 def test_a_board_that_ignores_the_line_to_home_is_noticed() -> None:
