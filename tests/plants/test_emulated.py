@@ -1,4 +1,4 @@
-"""The emulated cart as a process and as a plant: pyserial, a pseudo-terminal, lockstep."""
+"""The emulated cart as a process: what starts it, ends it and is said of its death."""
 
 import contextlib
 import os
@@ -6,86 +6,31 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from functools import partial
 
 import pytest
-import torch
-from tensordict import TensorDict
 
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import ConfigError, EmulatorError, LinkError
 from cartpole_rl.plants.emulated import EmulatedCart
-from cartpole_rl.plants.serial.errors import RefusedError
-from cartpole_rl.plants.serial.plant import SerialPlant, emulated_plant
+from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.plants.settings import EmulatedSettings
 from cartpole_rl.rig.hardware import nominal_hardware
 from cartpole_rl.signals import PARENT
 
-TURN = 4096
-
 fast = partial(EmulatorSettings, physics_step=1e-3)
-
-
-@pytest.fixture(scope="module")
-def plant() -> Iterator[SerialPlant]:
-    with contextlib.closing(emulated_plant(fast())) as plant:
-        yield plant
-
-
-def push(plant: SerialPlant, motor: int) -> TensorDict:
-    return plant.step(TensorDict({"motor": torch.full((1, 1), motor)}, [1]))["next"]
-
-
-def test_an_episode_begins_in_the_middle_with_a_hanging_pole(plant: SerialPlant) -> None:
-    cart, pole = plant.reset()["counts"][0].tolist()
-    assert abs(cart) < 100
-    assert abs(pole % TURN - TURN // 2) < 10
-
-
-@pytest.mark.parametrize("side", [1, -1])
-def test_the_end_of_the_track_ends_the_episode_and_the_next_one_begins(plant: SerialPlant, side: int) -> None:
-    plant.reset()
-    for _ in range(200):
-        frame = push(plant, side * 250)
-        if frame["done"]:
-            break
-    assert frame["terminated"]
-    assert not frame["truncated"]
-    assert plant.ended_by == "track"
-    assert side * frame["counts"][0, 0] >= plant.cart.information.soft_limit_counts
-    assert side * plant.cart.poll_state().motor_applied <= 0  # the firmware brakes
-    before_us = plant.cart.poll_state().time_us
-    frame = plant.reset()
-    assert plant.cart.poll_state().time_us - before_us < 20e6  # its brake lost no counts: it need not home
-    assert not frame["done"]
-    assert abs(frame["counts"][0, 0]) < 100
-    assert abs(frame["counts"][0, 1] % TURN - TURN // 2) < 16
-
-
-def test_an_upright_start() -> None:
-    said: list[str] = []
-    settings = fast(start="upright")
-    with contextlib.closing(emulated_plant(settings, prompt=said.append)) as plant:
-        for episode in (1, 2):
-            pole = plant.reset()["counts"][0, 1].item()
-            assert abs((pole + TURN // 2) % TURN - TURN // 2) < 60
-            assert len(said) == episode
-            falling = [push(plant, 0)["counts"][0, 1].item() for _ in range(60)]
-            assert abs(falling[-1] - pole) > 300
 
 
 def test_a_killed_emulator_truncates_and_the_next_reset_says_so() -> None:
     emulated = EmulatedCart(fast())
     with contextlib.closing(SerialPlant(emulated.settings, owned=emulated)) as plant:
         plant.reset()
-        before = push(plant, 100)
+        before = plant.step_one(100)
         os.kill(emulated.pid, signal.SIGKILL)
         time.sleep(0.2)
-        frame = push(plant, 100)
-        assert frame["truncated"]
-        assert not frame["terminated"]
-        assert frame["counts"].equal(before["counts"])
+        frame = plant.step_one(100)
+        assert (frame.terminated, frame.truncated) == ((False,), (True,))
+        assert frame.counts == before.counts
         assert plant.ended_by == "link"
         assert isinstance(plant.last_error, LinkError)
         with (
@@ -93,35 +38,6 @@ def test_a_killed_emulator_truncates_and_the_next_reset_says_so() -> None:
             pytest.raises(LinkError, match=r"link to the cart was lost .*exit code -9"),
         ):
             plant.reset()
-
-
-def test_pole_length_is_that_of_the_emulated_pole(plant: SerialPlant) -> None:
-    assert plant.pole_length.tolist() == pytest.approx([2 * EmulatorSettings().pole_com])
-
-
-def test_two_hundred_periods_pass_without_a_loss(plant: SerialPlant) -> None:
-    plant.reset()
-    cart = plant.cart
-    cart.statistics.clear()
-    first = cart.get_state()
-    for _ in range(200):
-        cart.set_motor(0)
-        last = cart.get_state()
-    assert last.tick == first.tick + 200
-    assert last.time_us - first.time_us == 200 * 20_000
-    summary = cart.statistics.summary()
-    assert [summary[name] for name in ("bad_frames", "lost_frames", "late_ticks")] == [0, 0, 0]
-    assert summary["latency_samples"] == 200
-
-
-def test_an_armed_cart_does_not_take_another_period(plant: SerialPlant) -> None:
-    plant.reset()
-    cart = plant.cart
-    cart.statistics.clear()
-    with pytest.raises(RefusedError, match=r"refused SET_PERIOD: .*stop it first"):
-        cart.set_period(10_000)
-    with pytest.raises(RefusedError, match="out of range"):
-        cart.stop() or cart.set_period(1)
 
 
 def ended(pid: int, seconds: float = 10.0) -> bool:

@@ -1,4 +1,7 @@
-"""Between episodes the emulated cart is brought back to the middle, and homed where that will not do."""
+"""Episodes on emulated carts, in lockstep over a pseudo-terminal.
+
+Between episodes the cart is brought back to the middle, and homed where that will not do.
+"""
 
 import contextlib
 import math
@@ -8,13 +11,11 @@ from functools import partial
 from typing import Any
 
 import pytest
-import torch
 from serial_peer import HANGING, CartPeer
-from tensordict import TensorDict
 
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.plants.serial.cart import SerialCart
-from cartpole_rl.plants.serial.errors import NotReadyError
+from cartpole_rl.plants.serial.errors import NotReadyError, RefusedError
 from cartpole_rl.plants.serial.moves import recentre
 from cartpole_rl.plants.serial.plant import SerialPlant, emulated_plant
 from cartpole_rl.plants.settings import SerialSettings
@@ -27,15 +28,11 @@ HOMING = 20.0  # s; no homing is done sooner, no re-centring of the default cart
 fast = partial(EmulatorSettings, physics_step=1e-3)
 
 
-def push(plant: SerialPlant, motor: int) -> TensorDict:
-    return plant.step(TensorDict({"motor": torch.full((1, 1), motor)}, [1]))["next"]
-
-
 def swing_up(plant: SerialPlant, steps: int = 90, half_swing: int = 12) -> None:
     """Wild but within the track: the pole is left turning or swinging far, the cart off the middle."""
     motor = 200
     for step in range(steps):
-        counts = push(plant, motor)["counts"][0, 0].item()
+        counts = plant.step_one(motor).counts[0]
         if step % half_swing == 0:
             motor = -motor
         if abs(counts) > 5000:
@@ -43,17 +40,19 @@ def swing_up(plant: SerialPlant, steps: int = 90, half_swing: int = 12) -> None:
     assert plant.ended_by == ""
 
 
-def reset(plant: SerialPlant) -> tuple[float, TensorDict]:
-    """Seconds that a reset takes by the cart's clock, and the first frame."""
+def reset(plant: SerialPlant, most: int = 16) -> float:
+    """Begin an episode; return the seconds that it took by the cart's clock.
+
+    It begins in the middle; the pole hangs, within `most` counts.
+    """
     before = plant.cart.poll_state().time_us
     plant.cart.statistics.latency.clear()
-    frame = plant.reset()
-    return (plant.cart.poll_state().time_us - before) * 1e-6, frame
-
-
-def hangs_in_the_middle(frame: TensorDict) -> bool:
-    cart, pole = frame["counts"][0].tolist()
-    return abs(cart) < MIDDLE and abs(pole - TURN // 2) < 16
+    frame = plant.reset_one()
+    cart, pole = frame.counts
+    assert abs(cart) < MIDDLE
+    assert abs(pole - TURN // 2) < most
+    assert not frame.ends
+    return (plant.cart.poll_state().time_us - before) * 1e-6
 
 
 @pytest.fixture(scope="module")
@@ -78,14 +77,10 @@ def plant() -> Iterator[SerialPlant]:
 )
 def test_many_carts_come_back_to_the_middle_sooner_than_homing(truth: dict[str, Any]) -> None:
     with contextlib.closing(emulated_plant(fast(**truth))) as plant:
-        homing, frame = reset(plant)
-        assert hangs_in_the_middle(frame)
+        homing = reset(plant)
         swing_up(plant)
         plant.halt()
-        seconds, frame = reset(plant)
-        assert hangs_in_the_middle(frame)
-        assert seconds < 0.6 * homing
-        assert not frame["done"]
+        assert reset(plant) < 0.6 * homing
 
 
 @pytest.mark.parametrize("period", [0.01, 0.1])
@@ -94,35 +89,32 @@ def test_other_control_periods(period: float) -> None:
         plant.reset()
         swing_up(plant, round(1.8 / period), max(1, round(0.24 / period)))
         plant.halt()
-        seconds, frame = reset(plant)
-        assert hangs_in_the_middle(frame)
-        assert seconds < HOMING
+        assert reset(plant) < HOMING
 
 
 def test_moves_of_the_host_are_no_latencies_of_the_policy(plant: SerialPlant) -> None:
-    plant.reset()
-    swing_up(plant)
-    seconds, _ = reset(plant)
-    assert seconds < HOMING
-    assert plant.cart.statistics.summary()["latency_samples"] == 0
-    push(plant, 0)
+    """Nor do whole turns of the pole add up."""
+    plant.reset_one()
+    for _ in range(2):
+        swing_up(plant, 150)
+        assert reset(plant) < HOMING
+        assert plant.cart.statistics.summary()["latency_samples"] == 0
+    plant.step_one(0)
     assert plant.cart.statistics.summary()["latency_samples"] == 1
 
 
 def test_rehome_always_homes_each_time() -> None:
     with contextlib.closing(emulated_plant(fast(), rehome="always")) as plant:
         for _ in range(2):
-            seconds, frame = reset(plant)
-            assert seconds > HOMING
-            assert hangs_in_the_middle(frame)
-            push(plant, 100)
+            assert reset(plant, most=10) > HOMING
+            plant.step_one(100)
 
 
 def test_a_cart_that_has_restarted_is_homed() -> None:
     with contextlib.closing(emulated_plant(fast(reset_at=26.0))) as plant:
         plant.reset()
         for _ in range(150):
-            if push(plant, 0)["done"]:
+            if plant.step_one(0).ends:
                 break
         assert plant.ended_by == "link"
         plant.reset()
@@ -130,22 +122,67 @@ def test_a_cart_that_has_restarted_is_homed() -> None:
         assert plant.cart.flags & Flags.HOMED
 
 
-def test_whole_turns_of_the_pole_do_not_add_up(plant: SerialPlant) -> None:
-    for _ in range(2):
-        _, frame = reset(plant)
-        assert hangs_in_the_middle(frame)
-        swing_up(plant, 150)
-
-
 def test_disturbed_frames_do_not_hinder_it() -> None:
     disturbed = fast(frame_loss=0.03, frame_corruption=0.03, frame_reordering=0.03, frame_duplication=0.03)
     with contextlib.closing(emulated_plant(disturbed)) as plant:
         plant.reset()
         swing_up(plant)
-        _, frame = reset(plant)
-        assert hangs_in_the_middle(frame)
+        reset(plant)
         seen = plant.cart.statistics.summary()
         assert min(seen[f"{name}_frames"] for name in ("overtaken", "repeated", "lost")) > 5
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_the_end_of_the_track_ends_the_episode_and_the_next_one_begins(plant: SerialPlant, side: int) -> None:
+    reset(plant)
+    for _ in range(200):
+        frame = plant.step_one(side * 250)
+        if frame.ends:
+            break
+    assert (frame.terminated, frame.truncated, plant.ended_by) == ((True,), (False,), "track")
+    assert side * frame.counts[0] >= plant.cart.information.soft_limit_counts
+    assert side * plant.cart.poll_state().motor_applied <= 0  # the firmware brakes
+    assert reset(plant) < HOMING  # its brake lost no counts: it need not home
+
+
+def test_an_upright_start() -> None:
+    said: list[str] = []
+    with contextlib.closing(emulated_plant(fast(start="upright"), prompt=said.append)) as plant:
+        for episode in (1, 2):
+            pole = plant.reset_one().counts[1]
+            assert abs((pole + TURN // 2) % TURN - TURN // 2) < 60
+            assert len(said) == episode
+            falling = [plant.step_one(0).counts[1] for _ in range(60)]
+            assert abs(falling[-1] - pole) > 300
+
+
+def test_pole_length_is_that_of_the_emulated_pole(plant: SerialPlant) -> None:
+    assert plant.pole_length.tolist() == pytest.approx([2 * EmulatorSettings().pole_com])
+
+
+def test_two_hundred_periods_pass_without_a_loss(plant: SerialPlant) -> None:
+    plant.reset_one()
+    cart = plant.cart
+    cart.statistics.clear()
+    first = cart.get_state()
+    for _ in range(200):
+        cart.set_motor(0)
+        last = cart.get_state()
+    assert last.tick == first.tick + 200
+    assert last.time_us - first.time_us == 200 * 20_000
+    summary = cart.statistics.summary()
+    assert [summary[name] for name in ("bad_frames", "lost_frames", "late_ticks")] == [0, 0, 0]
+    assert summary["latency_samples"] == 200
+
+
+def test_an_armed_cart_does_not_take_another_period(plant: SerialPlant) -> None:
+    plant.reset_one()
+    cart = plant.cart
+    cart.statistics.clear()
+    with pytest.raises(RefusedError, match=r"refused SET_PERIOD: .*stop it first"):
+        cart.set_period(10_000)
+    with pytest.raises(RefusedError, match="out of range"):
+        cart.stop() or cart.set_period(1)
 
 
 class TestRefusals:
