@@ -4,6 +4,7 @@ The cart runs on the wall clock and writes down, by its own clock, which command
 value was in force from when on. It homes at once, and is too heavy for full motor to take it off the track.
 """
 
+import itertools
 import json
 import signal
 import subprocess
@@ -114,8 +115,8 @@ class TellingCart:
         *lines, _ = self._told.read().split(b"\n")
         return [json.loads(line) for line in lines]
 
-    def stopped(self) -> tuple[float, str]:
-        """Wait until the motor stays at 0 after full motor: ms from the last command until then, and by what.
+    def check_stopped(self, *by: str) -> None:
+        """Check that after full motor the motor is soon at 0 and stays there, and by what: STOP or watchdog.
 
         A host on a busy machine may pause for longer than the watchdog allows, and then drive again.
         """
@@ -128,7 +129,9 @@ class TellingCart:
             if full and zero and zero[-1] > full[-1] and told == before:
                 commands = [line["us"] for line in told if line.get("motor") == FULL]
                 stops = [line["us"] for line in told if line.get("took") == "STOP" and line["us"] > full[0]]
-                return (zero[-1] - commands[-1]) / 1000, "STOP" if stops else "watchdog"
+                assert 0 < (zero[-1] - commands[-1]) / 1000 <= WATCHDOG_MS
+                assert ("STOP" if stops else "watchdog") in by
+                return
             before = told
             time.sleep(QUIET)
         raise AssertionError(f"the motor does not stay at 0: {self.told()}")
@@ -191,9 +194,7 @@ def test_a_signal_after_which_the_cart_can_be_driven_again(
 ) -> None:
     process = host(cart.port, manner)
     process.send_signal(ending)
-    after, through = cart.stopped()
-    assert 0 < after <= WATCHDOG_MS
-    assert through == by
+    cart.check_stopped(by)
     process.kill()
     process.wait()
     with SerialCart(SerialSettings(port=cart.port)) as again:
@@ -205,9 +206,7 @@ def test_a_pulled_cable(cart: TellingCart, host: Callable[..., "subprocess.Popen
     with Between(cart.port) as cable:
         process = host(cable.port)
         cable.cut()
-        after, through = cart.stopped()
-        assert 0 < after <= WATCHDOG_MS
-        assert through == "watchdog"
+        cart.check_stopped("watchdog")
         _, said = process.communicate(timeout=100)
         assert b"is the cart unplugged" in said
 
@@ -221,11 +220,10 @@ def serial_plant(cart: TellingCart) -> SerialPlant:
 
 
 def test_an_exception_in_the_policy(cart: TellingCart, make_environment: Callable) -> None:
-    decided: list[int] = []
+    decided = itertools.count(1)
 
     def fails(seen: TensorDictBase) -> TensorDictBase:
-        decided.append(1)
-        if len(decided) == 6:
+        if next(decided) == 6:
             raise ZeroDivisionError
         return always_right(seen)
 
@@ -234,26 +232,21 @@ def test_an_exception_in_the_policy(cart: TellingCart, make_environment: Callabl
         closing(make_environment(serial_plant(cart), motors=(-FULL, 0, FULL))) as env,
     ):
         run_batch(env, fails)
-    after, through = cart.stopped()
-    assert 0 < after <= WATCHDOG_MS
-    assert through == "STOP"
+    cart.check_stopped("STOP")
 
 
 def test_an_action_value_that_is_not_a_number(cart: TellingCart, make_environment: Callable) -> None:
-    decided: list[int] = []
+    decided = itertools.count(1)
 
     def diverges(seen: TensorDictBase) -> TensorDictBase:
-        decided.append(1)
-        value = torch.full((1, 3), 0.0 if len(decided) < 6 else float("nan"))
+        value = torch.full((1, 3), 0.0 if next(decided) < 6 else float("nan"))
         return always_right(seen).set("action_value", value)
 
     with closing(make_environment(serial_plant(cart), motors=(-FULL, 0, FULL))) as env:
         (episode,) = run_batch(env, diverges)
         assert episode.ended_by == "non_finite"
         assert episode.motor.tolist() == [FULL] * 5 + [0]
-        after, through = cart.stopped()  # though the port is still open
-    assert 0 < after <= WATCHDOG_MS
-    assert through == "STOP"
+        cart.check_stopped("STOP")  # though the port is still open
 
 
 def test_an_experiment_of_the_identification(cart: TellingCart) -> None:
@@ -267,13 +260,10 @@ def test_an_experiment_of_the_identification(cart: TellingCart) -> None:
     with closing(serial_plant(cart)) as plant:
         looked_at = 0
         for _, episode in conduct(plant, PERIOD_MS / 1000, experiments=experiments):
-            if (
-                episode.ended_by == "link"
-            ):  # a busy machine suspended the host, and a motor value came too late
+            if episode.ended_by == "link":  # a busy machine suspended the host, and a value came too late
                 cart.listen()
                 continue
-            after, _ = cart.stopped()
-            assert 0 < after <= WATCHDOG_MS
+            cart.check_stopped("STOP", "watchdog")
             commands = [line["motor"] for line in cart.told() if line.get("took") == "SET_MOTOR"]
             assert commands[-1] == 0
             assert episode.motor[-1] == 0
@@ -288,6 +278,4 @@ def test_the_end_of_an_episode(cart: TellingCart, make_environment: Callable) ->
     with closing(make_environment(serial_plant(cart), motors=(-FULL, 0, FULL), time_limit=6)) as env:
         (episode,) = run_batch(env, always_right)
         assert episode.ended_by == "time"
-        after, through = cart.stopped()  # though the port is still open
-        assert 0 < after <= WATCHDOG_MS
-        assert through == "STOP"
+        cart.check_stopped("STOP")  # though the port is still open

@@ -133,13 +133,9 @@ class Ticking(HomingForever):
 def test_a_cart_with_a_wrong_clock_is_not_driven(homes: bool) -> None:
     with Ticking(1.3) as peer, peer.ticking(), SerialCart(quick_settings(peer.port, timeout=10.0)) as cart:
         with pytest.raises(LinkError, match=r"passes 1\.[23]\d\d s in a second of this computer") as told:
-            home(cart) if homes else read(cart)
+            cart.home() if homes else read(cart)
         assert str(told.value).endswith("so all speeds would be wrong: correct the timer in its firmware")
     wait_for(lambda: not peer.flags & Flags.ARMED)
-
-
-def home(cart: SerialCart) -> None:
-    cart.home()
 
 
 def read(cart: SerialCart) -> None:

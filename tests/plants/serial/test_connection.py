@@ -20,6 +20,7 @@ from cartpole_rl.wire.messages import (
     Flags,
     Hello,
     Home,
+    Message,
     Nack,
     Reason,
     SetMotor,
@@ -114,37 +115,24 @@ def test_a_cart_of_another_version_is_told_in_one_line() -> None:
 
 
 @pytest.mark.parametrize(
-    ("reason", "words"),
+    ("ask", "reason", "error", "words"),
     [
-        (Reason.NOT_HOMED, "START: it is not homed"),
-        (Reason.BUSY, "START: it is armed or homing"),
-        (99, "START: reason 99, unknown here"),
+        (Start, Reason.NOT_HOMED, RefusedError, "START: it is not homed"),
+        (Start, Reason.BUSY, RefusedError, "START: it is armed or homing"),
+        (Start, 99, RefusedError, "START: reason 99, unknown here"),
+        (Start, Reason.FAULT_LATCHED, FaultError, "a fault is latched: remove its cause"),
+        (StartPolicy, Reason.UNKNOWN_TYPE, RefusedError, "refused START_POLICY: its board has no policy"),
     ],
 )
-def test_a_refusal_says_why(reason: int, words: str) -> None:
-    with Refusing(Start, reason) as peer, SerialCart(quick_settings(peer.port)) as cart:
-        with pytest.raises(RefusedError, match=words) as caught:
-            cart.start()
-        assert caught.value.reason == reason
+def test_a_refusal_says_why(ask: type[Message], reason: int, error: type[PlantError], words: str) -> None:
+    with Refusing(ask, reason) as peer, SerialCart(quick_settings(peer.port)) as cart:
+        with pytest.raises(error, match=words) as caught:
+            cart.start() if ask is Start else cart.start_policy()
+        assert getattr(caught.value, "reason", reason) == reason
+        assert not peer.flags & Flags.ARMED
         began = len(peer.received)
         assert cart.get_state()  # a refused frame is never acknowledged, and not waited for
         assert len(peer.received) == began
-
-
-def test_a_board_without_a_policy_says_so() -> None:
-    with (
-        Refusing(StartPolicy, Reason.UNKNOWN_TYPE) as peer,
-        SerialCart(quick_settings(peer.port)) as cart,
-        pytest.raises(RefusedError, match="refused START_POLICY: its board has no policy"),
-    ):
-        cart.start_policy()
-
-
-def test_a_refusal_for_a_fault_is_a_fault() -> None:
-    with Refusing(Start, Reason.FAULT_LATCHED) as peer, SerialCart(quick_settings(peer.port)) as cart:
-        with pytest.raises(FaultError, match="a fault is latched: remove its cause"):
-            cart.start()
-        assert not peer.flags & Flags.ARMED
 
 
 @pytest.mark.parametrize("accepted", [10, 140, 300])
@@ -300,55 +288,55 @@ def test_another_agent_on_a_board_that_came_later_does_not_drive(reopens: bool) 
         assert len(peer.messages(StartPolicy)) == 1
 
 
-def test_an_acknowledgement_of_home_that_comes_after_its_repetition() -> None:
-    """The repetition is refused, so that no state acknowledges it."""
+class Busy(CartPeer):
+    """Refuses the first HOMEs; if it is `late`, the first one starts, and its ACK comes with the second."""
 
-    class Stalled(CartPeer):
-        late: tuple[bytes, ...] = ()
+    def __init__(self, refusals: int, late: bool) -> None:
+        super().__init__()
+        self.refusals, self.late, self.held = refusals, late, ()
 
-        def answer(self, frame: Frame) -> Iterable[bytes]:
-            if not isinstance(frame.message, Home):
-                yield from super().answer(frame)
-            elif not self.late:
-                self.late = (*super().answer(frame),)
-            else:
-                yield from self.late
-                yield self.encode(Nack(frame.sequence, Home.TYPE, Reason.BUSY))
+    def answer(self, frame: Frame) -> Iterable[bytes]:
+        if not isinstance(frame.message, Home) or not self.refusals:
+            yield from super().answer(frame)
+            return
+        self.refusals -= 1
+        if self.late and not self.held:
+            self.held = (*super().answer(frame),)
+            return
+        yield from self.held
+        yield self.encode(Nack(frame.sequence, Home.TYPE, Reason.BUSY))
 
-    with Stalled() as peer, SerialCart(quick_settings(peer.port)) as cart:
+
+@pytest.mark.parametrize(("refusals", "late", "asked"), [(2, True, 2), (3, False, 4)])
+def test_home_is_repeated_while_the_brake_acts_and_ends_if_only_its_acknowledgement_was_late(
+    refusals: int, late: bool, asked: int
+) -> None:
+    """No state acknowledges a repetition that is refused."""
+    with Busy(refusals, late) as peer, SerialCart(quick_settings(peer.port)) as cart:
         assert cart.home().tick
-        assert len(peer.messages(Home)) == 2
+        assert len(peer.messages(Home)) == asked
 
 
-def test_home_is_repeated_while_the_brake_acts() -> None:
-    class Braking(CartPeer):
-        refusals = 3
+class Distant(CartPeer):
+    """Answers each STOP, or every frame, `delay` s later."""
 
-        def answer(self, frame: Frame) -> Iterable[bytes]:
-            if not isinstance(frame.message, Home) or not self.refusals:
-                yield from super().answer(frame)
-                return
-            self.refusals -= 1
-            yield self.encode(Nack(frame.sequence, Home.TYPE, Reason.BUSY))
+    delay, to = 0.0, Stop
 
-    with Braking() as peer, SerialCart(quick_settings(peer.port)) as cart:
-        assert cart.home().tick
-        assert len(peer.messages(Home)) == 4
+    def answer(self, frame: Frame) -> Iterable[bytes]:
+        held = [*super().answer(frame)]
+        if isinstance(frame.message, self.to):
+            time.sleep(self.delay)
+        yield from held
 
 
 def test_a_link_without_states_in_time_is_measured_before_the_cart_is_armed() -> None:
     """No state tells whether the cart has a clock of its own."""
-
-    class Late(CartPeer):
-        def answer(self, frame: Frame) -> Iterable[bytes]:
-            held = [*super().answer(frame)]
-            time.sleep(0.05)
-            yield from held
-
-    with Late(paced=True) as peer, SerialCart(quick_settings(peer.port, answer_timeout=0.5)) as cart:
-        with pytest.raises(LinkError, match="over a period of 20 ms"):
-            cart.start()
-        assert not peer.messages(Start)
+    with Distant(paced=True) as peer:
+        peer.delay, peer.to = 0.05, Message
+        with SerialCart(quick_settings(peer.port, answer_timeout=0.5)) as cart:
+            with pytest.raises(LinkError, match="over a period of 20 ms"):
+                cart.start()
+            assert not peer.messages(Start)
 
 
 @pytest.mark.parametrize("begin", [SerialCart.home, SerialCart.start, SerialCart.start_policy])
@@ -360,17 +348,6 @@ def test_a_link_that_takes_over_a_period_drives_no_cart(begin: Callable[[SerialC
         with pytest.raises(LinkError, match=r"takes 2\d ms|takes \d{2,} ms, over a period of 5 ms"):
             begin(cart)
         assert not peer.messages(Home) + peer.messages(Start) + peer.messages(StartPolicy)
-
-
-class Distant(CartPeer):
-    """Answers each STOP `delay` s later."""
-
-    delay = 0.0
-
-    def answer(self, frame: Frame) -> Iterable[bytes]:
-        if isinstance(frame.message, Stop):
-            time.sleep(self.delay)
-        yield from super().answer(frame)
 
 
 def test_on_a_lockstep_cart_no_time_passes_on_the_way() -> None:

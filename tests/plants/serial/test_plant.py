@@ -1,4 +1,4 @@
-"""The plant on a scripted cart: endings, clocks and faults. On the emulated cart: ../test_emulated.py."""
+"""The plant on a scripted cart: endings, clocks and faults. On emulated carts: test_recentring.py."""
 
 import threading
 from collections.abc import Iterable, Iterator
@@ -18,12 +18,6 @@ from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.rig.hardware import nominal_hardware
 from cartpole_rl.wire.frames import Frame
 from cartpole_rl.wire.messages import ClearFault, Fault, Flags, Home, Nack, Reason, SetMotor, Start, Stop
-
-
-@pytest.fixture
-def peer() -> Iterator[CartPeer]:
-    with CartPeer() as peer:
-        yield peer
 
 
 @pytest.fixture
@@ -104,7 +98,7 @@ def test_a_value_that_is_replaced_by_0_is_the_one_that_counts(
 
 
 def test_a_value_that_was_lost_did_not_drive(peer: CartPeer, plant: SerialPlant) -> None:
-    """What drove is the value before, also in the period at whose end the watchdog sets the motor to 0."""
+    """What drove is the value before, also in a period at whose end the watchdog or a fault sets it to 0."""
     plant.reset()
     assert driven(plant, 100) == 100
     answer = peer.answer
@@ -115,6 +109,21 @@ def test_a_value_that_was_lost_did_not_drive(peer: CartPeer, plant: SerialPlant)
     assert driven(plant, 200) == 0
     peer.answer, peer.flags = answer, peer.flags & ~Flags.WATCHDOG
     assert driven(plant, 200) == 200
+    hear_only_stop(peer)
+    peer.state = replace(peer.state, motor_applied=0, fault=Fault.STALL)
+    assert driven(plant, 100) == 200
+
+
+def limited(peer: CartPeer, *applied: int) -> None:
+    """Let a limit of the track act, with these motor values in force at the ends of the next periods."""
+    answer, values = peer.answer, iter(applied)
+
+    def override(frame: Frame) -> Iterator[bytes]:
+        *answers, _ = answer(frame)
+        yield from answers
+        yield peer.next_state(motor_applied=next(values, 0))
+
+    peer.answer, peer.flags = override, peer.flags | Flags.SOFT_LIMIT
 
 
 def test_a_value_that_a_limit_of_the_track_replaced_did_not_drive(peer: CartPeer, plant: SerialPlant) -> None:
@@ -122,24 +131,14 @@ def test_a_value_that_a_limit_of_the_track_replaced_did_not_drive(peer: CartPeer
     plant.reset()
     commanded = []
     plant.on_command = commanded.append
-    answer = peer.answer
-
-    def limited(motor: int) -> None:
-        def override(frame: Frame) -> Iterator[bytes]:
-            *answers, _ = answer(frame)
-            yield from answers
-            yield peer.next_state(motor_applied=motor)
-
-        peer.answer = override
-
-    peer.flags |= Flags.SOFT_LIMIT
+    limited(peer, -255, 0)
     for motor in (-255, 0):
-        limited(motor)
         given = TensorDict({"motor": torch.tensor([[200]])}, [1])
         assert plant._step(given)["motor_applied"].item() == motor
         assert given["motor"].item() == motor
     assert commanded == [200, 200]
-    peer.answer, peer.flags = answer, peer.flags & ~Flags.SOFT_LIMIT
+    del peer.answer
+    peer.flags &= ~Flags.SOFT_LIMIT
     assert driven(plant, 200) == 200
 
 
@@ -147,14 +146,7 @@ def test_the_value_that_drove_longest_counts_where_a_limit_begins_or_ends(
     peer: CartPeer, plant: SerialPlant
 ) -> None:
     plant.reset()
-    answer, applied = peer.answer, iter([0, -255, 200, 200])
-
-    def override(frame: Frame) -> Iterator[bytes]:
-        *answers, _ = answer(frame)
-        yield from answers
-        yield peer.next_state(motor_applied=next(applied, 0))
-
-    peer.answer, peer.flags = override, peer.flags | Flags.SOFT_LIMIT
+    limited(peer, 0, -255, 200, 200)
     assert driven(plant, 200) == 200  # the limit took it away at the end
     assert driven(plant, 200) == -255
     assert driven(plant, 200) == -255  # the brake let go at the end
@@ -188,14 +180,6 @@ def test_a_count_that_the_host_finds_frozen_is_homed_again(peer: CartPeer, plant
     plant.distrust()
     plant.reset()
     assert len(peer.messages(Home)) == 2
-
-
-def test_a_fault_ends_the_value_that_drove(peer: CartPeer, plant: SerialPlant) -> None:
-    plant.reset()
-    plant.step_one(100)
-    peer.state = replace(peer.state, motor_applied=0, fault=Fault.STALL)
-    hear_only_stop(peer)
-    assert driven(plant, 200) == 100
 
 
 @pytest.mark.parametrize("motor", [256, -30_000])
@@ -287,25 +271,33 @@ def test_beyond_the_soft_limit_the_episode_ends_on_the_track(
     assert_stopped(peer)
 
 
-def test_a_hard_limit_is_an_ending_on_the_track(peer: CartPeer, plant: SerialPlant) -> None:
-    plant.reset()
-    peer.state = replace(peer.state, fault=int(Fault.HARD_LIMIT))
-    assert step(plant, 0)["terminated"]
-    assert plant.ended_by == "track"
-
-
 @pytest.mark.parametrize("fault", list(Fault))
 def test_a_latched_fault_is_not_cleared_with_nobody_asked(
     peer: CartPeer, plant: SerialPlant, fault: Fault
 ) -> None:
+    """Only that of the hard limit is an ending on the track."""
     plant.reset()
     peer.state = replace(peer.state, fault=int(fault))
-    assert step(plant, 100)["done"]
+    frame = step(plant, 100)
+    on_track = fault == Fault.HARD_LIMIT
+    assert (frame["terminated"], frame["truncated"]) == (on_track, not on_track)
+    assert plant.ended_by == ("track" if on_track else "fault")
     homings = len(peer.messages(Home))
     with pytest.raises(FaultError, match=r"check the cart, then confirm in a terminal that it may move"):
         plant.reset()
     assert not peer.messages(ClearFault)
     assert len(peer.messages(Home)) == homings
+
+
+def fault_and_reset(peer: CartPeer, plant: SerialPlant) -> None:
+    """Latch a fault in a step, and begin the next episode."""
+    peer.state = replace(peer.state, fault=int(Fault.STALL))
+    step(plant, 100)
+    assert plant.ended_by == "fault"
+    assert isinstance(plant.last_error, FaultError)
+    assert_stopped(peer)
+    assert not plant.reset()["done"]
+    assert plant.ended_by == ""
 
 
 def test_a_person_who_agrees_lets_a_fault_be_cleared(peer: CartPeer) -> None:
@@ -316,48 +308,27 @@ def test_a_person_who_agrees_lets_a_fault_be_cleared(peer: CartPeer) -> None:
         return True
 
     peer.carry_out = lambda message: clear(peer, message)
-    plant = SerialPlant(quick_settings(peer.port), confirm=agree)
-    plant.reset()
-    for _ in range(2):
-        peer.state = replace(peer.state, fault=int(Fault.STALL))
-        step(plant, 100)
+    with closing(SerialPlant(quick_settings(peer.port), confirm=agree)) as plant:
         plant.reset()
+        for _ in range(2):
+            fault_and_reset(peer, plant)
     assert len(asked) == 2
     assert "the motor was driven but the cart did not move" in asked[0]
     assert len(peer.messages(Home)) == 3  # once at first, and after each fault
-    plant.close()
 
 
 def test_unattended_work_gives_up_after_the_stated_number_of_faults(peer: CartPeer) -> None:
-    peer.carry_out = lambda message: clear(peer, message)
-    plant = SerialPlant(quick_settings(peer.port, clear_faults=2))
-    plant.reset()
-    for _ in range(2):
-        peer.state = replace(peer.state, fault=int(Fault.POLE_ENCODER))
-        step(plant, 100)
+    """A fault whose cause persists counts as one."""
+    with closing(SerialPlant(quick_settings(peer.port, clear_faults=2))) as plant:
         plant.reset()
-    peer.state = replace(peer.state, fault=int(Fault.POLE_ENCODER))
-    step(plant, 100)
-    with pytest.raises(FaultError, match=r"2 faults were cleared unattended \(plant.clear_faults\): check"):
-        plant.reset()
-    plant.close()
-
-
-def test_a_fault_ends_the_episode_and_is_cleared_in_the_next_reset(peer: CartPeer) -> None:
-    plant = SerialPlant(quick_settings(peer.port, clear_faults=2))
-    plant.reset()
-    peer.state = replace(peer.state, fault=int(Fault.STALL))
-    frame = step(plant, 0)
-    assert (frame["terminated"], frame["truncated"]) == (False, True)
-    assert plant.ended_by == "fault"
-    assert isinstance(plant.last_error, FaultError)
-    assert_stopped(peer)
-    with pytest.raises(FaultError, match="motor"):
-        plant.reset()
-    peer.carry_out = lambda message: clear(peer, message)
-    assert not plant.reset()["done"]
-    assert plant.ended_by == ""
-    plant.close()
+        with pytest.raises(FaultError, match="motor"):
+            fault_and_reset(peer, plant)
+        peer.carry_out = lambda message: clear(peer, message)
+        assert not plant.reset()["done"]
+        with pytest.raises(
+            FaultError, match=r"2 faults were cleared unattended \(plant.clear_faults\): check"
+        ):
+            fault_and_reset(peer, plant)
 
 
 @pytest.mark.parametrize("fault", [0, int(Fault.STALL)])

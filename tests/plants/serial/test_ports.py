@@ -81,44 +81,33 @@ def test_what_came_and_went() -> None:
     assert changes([FTDI], [FTDI]) == ([], [])
 
 
-def test_the_only_cart_is_taken_whatever_else_there_is() -> None:
-    assert only_cart([MODEM, CH340]) == "/dev/ttyUSB0"
+GONE = r"the cart's port \(FTDI .*A50285BI\) is gone; there are .*: plug the"
+MOVED = r"is at /dev/ttyUSB0 now: give plant.port=/dev/ttyUSB0"
 
 
 @pytest.mark.parametrize(
-    ("given", "now", "found"),
+    ("earlier", "given", "now", "found"),
     [
-        ("auto", [CH340, FTDI], "/dev/ttyUSB1"),
-        ("auto", [replace(FTDI, device="/dev/ttyUSB0")], "/dev/ttyUSB0"),
-        ("/dev/ttyUSB1", [CH340, FTDI], "/dev/ttyUSB1"),
-        ("auto", [CH340], None),
-        ("auto", [replace(FTDI, serial_number="other")], None),
-        ("/dev/ttyUSB1", [replace(CH340, device="/dev/ttyUSB1")], None),
+        (FTDI, "auto", [CH340, FTDI], "/dev/ttyUSB1"),
+        (FTDI, "auto", [replace(FTDI, device="/dev/ttyUSB0")], "/dev/ttyUSB0"),
+        (FTDI, "/dev/ttyUSB1", [CH340, FTDI], "/dev/ttyUSB1"),
+        (FTDI, "/dev/ttyUSB1", [replace(FTDI, device="/dev/ttyUSB0")], MOVED),
+        (FTDI, "auto", [CH340], GONE),
+        (FTDI, "auto", [replace(FTDI, serial_number="other")], GONE),
+        (FTDI, "/dev/ttyUSB1", [replace(CH340, device="/dev/ttyUSB1")], GONE),
+        (CH340, "auto", [replace(CH340, device=f"/dev/ttyUSB{number}") for number in (1, 2)], "is gone"),
     ],
 )
 def test_a_connection_that_was_lost_is_made_to_the_same_device(
-    given: str, now: list[UsbPort], found: str | None, monkeypatch: pytest.MonkeyPatch
+    earlier: UsbPort, given: str, now: list[UsbPort], found: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """One that moved is named, and of two alike none is taken."""
     monkeypatch.setattr(port, "found_ports", lambda: now)
-    if found is not None:
-        assert port_of(FTDI, given) == found
+    if found.startswith("/dev"):
+        assert port_of(earlier, given) == found
         return
-    with pytest.raises(
-        PortError, match=r"the cart's port \(FTDI .*A50285BI\) is gone; there are .*: plug the"
-    ):
-        port_of(FTDI, given)
-
-
-def test_a_device_that_moved_is_named_and_of_two_alike_none_is_taken(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    moved = [replace(FTDI, device="/dev/ttyUSB0")]
-    monkeypatch.setattr(port, "found_ports", lambda: moved)
-    with pytest.raises(PortError, match=r"is at /dev/ttyUSB0 now: give plant.port=/dev/ttyUSB0"):
-        port_of(FTDI, "/dev/ttyUSB1")
-    moved[:] = [replace(CH340, device=f"/dev/ttyUSB{number}") for number in (1, 2)]
-    with pytest.raises(PortError, match="is gone"):
-        port_of(CH340, "auto")
+    with pytest.raises(PortError, match=found):
+        port_of(earlier, given)
 
 
 @pytest.mark.parametrize("number", ["", "0001"])
@@ -159,19 +148,19 @@ def test_another_cart_is_not_driven_after_the_first_was_unplugged(
         assert not second.received
 
 
-def test_of_several_a_person_chooses() -> None:
-    with pytest.raises(PortError, match=r"2 of the ports .*ttyUSB0 \(WCH CH340.*ttyUSB1 \(FTDI.*watch=true"):
-        only_cart([CH340, FTDI, MODEM])
+def test_the_only_cart_is_taken_whatever_else_there_is() -> None:
+    assert only_cart([MODEM, CH340]) == "/dev/ttyUSB0"
 
 
 @pytest.mark.parametrize(
     ("ports", "words"),
     [
+        ([CH340, FTDI, MODEM], r"2 of the ports .*ttyUSB0 \(WCH CH340.*ttyUSB1 \(FTDI.*watch=true"),
         ([], "looks like a cart; plug the cart in"),
         ([MODEM], r"looks like a cart; there are /dev/ttyACM0 \(no"),
     ],
 )
-def test_none_that_looks_like_a_cart(ports: list[UsbPort], words: str) -> None:
+def test_none_and_several_are_left_to_a_person(ports: list[UsbPort], words: str) -> None:
     with pytest.raises(PortError, match=words):
         only_cart(ports)
 
@@ -189,7 +178,9 @@ def test_a_cart_on_auto_says_why_it_finds_none() -> None:
         ("hwgrep://(", "is neither a device path nor a URL of pyserial: error('missing )"),
         ("socket://host", "names no TCP port; give socket://HOST:PORT"),
         ("ttyUSB77", "did you mean /dev/ttyUSB77?"),
+        ("/dev/nosuch0", "/dev/nosuch0 does not exist: plug the cart in, or choose one of the ports found"),
         ("/tmp", "/tmp is not a serial port; cartpole-find-port lists them"),
+        (__file__, f"{__file__} is not a serial port; cartpole-find-port lists them"),
         ("loop://?logging=foo", "is neither a device path nor a URL of pyserial: KeyError('foo')"),
     ],
 )
@@ -217,15 +208,14 @@ def _pseudo_terminals_are_ports(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.skipif(sys.platform != "linux", reason="Linux's call")
 @pytest.mark.usefixtures("_pseudo_terminals_are_ports")
 class TestExclusive:
-    def test_a_port_is_exclusive_while_it_is_open(self) -> None:
-        with CartPeer() as peer:
-            cart = SerialCart(quick_settings(peer.port))
-            for _ in range(2):
-                assert not is_exclusive(peer)
-                cart.open()
-                assert is_exclusive(peer)
-                cart.close()
+    def test_a_port_is_exclusive_while_it_is_open(self, peer: CartPeer) -> None:
+        cart = SerialCart(quick_settings(peer.port))
+        for _ in range(2):
             assert not is_exclusive(peer)
+            cart.open()
+            assert is_exclusive(peer)
+            cart.close()
+        assert not is_exclusive(peer)
 
     def test_a_port_without_a_cart_is_given_back(self) -> None:
         with Peer() as peer:
@@ -242,11 +232,8 @@ class TestExclusive:
                 open_port(peer.port, 921600, 1.0)
 
     def test_a_pulled_cable_is_closed_quietly(self) -> None:
-        with CartPeer() as peer:
-            cart = SerialCart(quick_settings(peer.port))
-            cart.open()
+        with CartPeer() as peer, SerialCart(quick_settings(peer.port)):
             peer.unplug()
-            cart.close()
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="Linux's call")

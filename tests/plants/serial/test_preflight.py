@@ -15,6 +15,7 @@ from cartpole_rl.plants.emulated import EmulatedCart
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.errors import NotReadyError
 from cartpole_rl.plants.serial.preflight import (
+    Finding,
     Probe,
     cart_direction,
     deadband,
@@ -45,6 +46,14 @@ good_limits = replace(INFO, soft_limit_counts=16704, hard_limit_counts=17539)
 
 def patient(port: str) -> SerialSettings:
     return SerialSettings(port=port, timeout=5, nudge_after=2, answer_timeout=2, connect_timeout=10)
+
+
+def findings(port: str, **changes: float) -> list[Finding]:
+    """Return what the preflight of the cart on a port finds."""
+    cart = SerialCart(patient(port).model_copy(update=changes))
+    found = list(preflight(cart))
+    cart.close()
+    return found
 
 
 @pytest.fixture(scope="module")
@@ -185,17 +194,15 @@ class Sluggish(SerialCart):
 
 def test_a_restart_is_a_finding_whatever_the_check_made_of_it() -> None:
     """The counts begin anew, which looks like wires the wrong way round."""
-    with EmulatedCart(fast(reset_at=28)) as emulated, SerialCart(patient(emulated.port)) as cart:
-        finding = list(preflight(cart))[-1]
-    assert not finding.ready
-    assert finding.words == "the cart has restarted; check its power"
+    with EmulatedCart(fast(reset_at=28)) as emulated:
+        *_, last = findings(emulated.port)
+    assert not last.ready
+    assert last.words == "the cart has restarted; check its power"
 
 
 def test_a_cart_that_does_not_move_is_a_finding_with_its_remedy() -> None:
     with EmulatedCart(fast(stuck_encoder="cart", stuck_at=0.0)) as emulated:
-        cart = SerialCart(patient(emulated.port))
-        *before, last = preflight(cart)
-        cart.close()
+        *before, last = findings(emulated.port)
     assert [finding.check for finding in before] == ["link", "limits"]
     assert (last.check, last.ready) == ("homing", False)
     assert last.words == (
@@ -204,26 +211,18 @@ def test_a_cart_that_does_not_move_is_a_finding_with_its_remedy() -> None:
     )
 
 
-def test_the_motor_is_stopped_before_a_check_that_failed_is_shown() -> None:
+def test_the_motor_is_stopped_before_a_check_that_failed_is_shown(peer: CartPeer) -> None:
     """Whoever shows it may block: a terminal that was stopped, a full pipe."""
-    with CartPeer() as peer:
-        cart = SerialCart(SerialSettings(port=peer.port))
+    with SerialCart(SerialSettings(port=peer.port)) as cart:
         for finding in preflight(cart):
             assert finding.ready or not peer.flags & Flags.ARMED
         assert (finding.check, finding.ready) == ("cart encoder", False)
         assert any(message.motor for message in peer.messages(SetMotor))
-        cart.close()
 
 
 def test_a_bad_cable_is_told_before_anything_moves() -> None:
     with EmulatedCart(fast(frame_corruption=0.2)) as emulated:
-        cart = SerialCart(
-            patient(emulated.port).model_copy(
-                update={"answer_timeout": 0.05, "nudge_after": 0.05, "retries": 30}
-            )
-        )
-        (finding,) = preflight(cart)
-        cart.close()
+        (finding,) = findings(emulated.port, answer_timeout=0.05, nudge_after=0.05, retries=30)
     assert not finding.ready
     assert "use a short shielded cable" in finding.words
     assert "set BAUD in the board's file, flash again, and give plant.baud=115200" in finding.words
@@ -238,38 +237,28 @@ def test_the_lines_of_another_carts_file_are_told() -> None:
 
 
 @pytest.mark.parametrize("period_us", [0, 100_001])
-def test_a_period_that_the_protocol_does_not_allow(period_us: int) -> None:
-    with CartPeer() as peer:
-        peer.info = replace(good_limits, period_us=period_us)
-        cart = SerialCart(patient(peer.port))
-        (finding,) = preflight(cart)
-        cart.close()
+def test_a_period_that_the_protocol_does_not_allow(peer: CartPeer, period_us: int) -> None:
+    peer.info = replace(good_limits, period_us=period_us)
+    (finding,) = findings(peer.port)
     assert (finding.check, finding.ready) == ("link", False)
     assert finding.words.startswith(f"INFO says period {period_us} us, not 5000 to 100000: correct the firm")
 
 
-def test_a_cart_that_falls_silent_is_a_finding() -> None:
-    with CartPeer() as peer:
-        talk, peer.info = peer.answer, good_limits
-        peer.answer = lambda frame: () if peer.messages(Home) else talk(frame)
-        cart = SerialCart(patient(peer.port).model_copy(update={"answer_timeout": 0.05, "retries": 1}))
-        *before, last = preflight(cart)
-        cart.close()
+def test_a_cart_that_falls_silent_is_a_finding(peer: CartPeer) -> None:
+    talk, peer.info = peer.answer, good_limits
+    peer.answer = lambda frame: () if peer.messages(Home) else talk(frame)
+    *before, last = findings(peer.port, answer_timeout=0.05, retries=1)
     assert [finding.check for finding in before] == ["link", "limits"]
     assert (last.check, last.ready) == ("homing", False)
     assert "did not answer HOME, asked 2 times: check its cable and power" in last.words
 
 
-def test_a_cart_too_far_out_is_stopped() -> None:
-    with CartPeer() as peer, SerialCart(patient(peer.port)) as cart:
+def test_a_cart_too_far_out_is_stopped_and_a_fault_ends_a_move(peer: CartPeer) -> None:
+    with SerialCart(patient(peer.port)) as cart:
         peer.state = replace(peer.state, cart_counts=4000)
         with pytest.raises(NotReadyError, match=r"went \+91 mm, further than any requested move"):
             Probe(cart).arm()
         assert not peer.flags & Flags.ARMED
-
-
-def test_a_fault_ends_a_move() -> None:
-    with CartPeer() as peer, SerialCart(patient(peer.port)) as cart:
-        peer.state = replace(peer.state, fault=2)
+        peer.state = replace(peer.state, cart_counts=0, fault=2)
         with pytest.raises(FaultError, match="did not move"):
             Probe(cart).arm()

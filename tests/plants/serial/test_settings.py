@@ -1,6 +1,5 @@
 """Settings of plant=serial reach the port and the calls that wait."""
 
-from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
 
@@ -8,6 +7,8 @@ import pytest
 import serial
 from serial_peer import CartPeer
 
+from cartpole_rl.checking import validated
+from cartpole_rl.composition import compose
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import ConfigError, LinkError, PlantError
 from cartpole_rl.plants.settings import SerialSettings
@@ -26,15 +27,9 @@ TIMEOUTS = {
 }
 
 
-@pytest.fixture
-def peer() -> Iterator[CartPeer]:
-    with CartPeer() as peer:
-        yield peer
-
-
 def evaluation(**plant: object) -> EvaluateConfig:
-    overrides = {f"plant.{name}": value for name, value in plant.items()}
-    return load_settings(EvaluateConfig, {"run": "lqr", "plant": "serial", **overrides})
+    values = compose("evaluate", {"run": "lqr", "plant": "serial"})
+    return validated(EvaluateConfig, {**values, "plant": values["plant"] | plant})
 
 
 def environment(config: EvaluateConfig) -> CartPoleEnv:

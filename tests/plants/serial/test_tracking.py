@@ -71,22 +71,20 @@ def test_another_connection_begins_without_the_states_of_the_last_one() -> None:
     assert (tracker.restarts, tracker.statistics.lost_frames) == (0, 0)
 
 
-@pytest.mark.parametrize(("delay", "late"), [(0.019, 0), (0.021, 1)])
-def test_a_command_is_late_after_a_period_in_which_the_tick_advanced(delay: float, late: int) -> None:
+@pytest.mark.parametrize(
+    ("delay", "tick", "late"),
+    [(0.019, 3, 0), (0.021, 3, 1), (10.0, 2, 0)],
+    ids=["in time", "late", "a lockstep cart waits"],
+)
+def test_a_command_is_late_after_a_period_in_which_the_tick_advanced(
+    delay: float, tick: int, late: int
+) -> None:
     tracker = tracker_of_a_cart()
     drive(tracker, state_at(1), delay)
-    tracker.receive(state_at(3), Flags.ARMED, 0.04, 0)
-    tracker.hand_out(state_at(3))
+    tracker.receive(state_at(tick), Flags.ARMED, 0.04, 0)
+    tracker.hand_out(state_at(tick))
     assert tracker.statistics.late_ticks == late
     assert [*tracker.statistics.latency] == [delay]
-
-
-def test_a_lockstep_cart_waits_and_nothing_is_late() -> None:
-    tracker = tracker_of_a_cart()
-    drive(tracker, state_at(1), 10.0)
-    tracker.receive(state_at(2), Flags.ARMED, 10.0, 0)
-    tracker.hand_out(state_at(2))
-    assert tracker.statistics.late_ticks == 0
 
 
 def test_a_state_that_is_passed_over_is_late_only_while_driving() -> None:
@@ -147,18 +145,18 @@ def test_the_newest_samples_stay() -> None:
 
 def test_percentiles_in_milliseconds() -> None:
     seen = LinkStatistics()
-    for number in range(10_001):
-        seen.latency.append(number * 1e-6)
+    seen.latency.extend(number * 1e-6 for number in range(10_001))
+    expected = {"median": 5.0, "p99": 9.9, "p999": 9.99, "max": 10.0}
     summary = seen.summary()
-    assert summary["latency_median_ms"] == pytest.approx(5.0)
-    assert summary["latency_p99_ms"] == pytest.approx(9.9)
-    assert summary["latency_p999_ms"] == pytest.approx(9.99)
-    assert summary["latency_max_ms"] == pytest.approx(10.0)
+    assert {key: summary[f"latency_{key}_ms"] for key in expected} == pytest.approx(expected)
 
 
 def test_nothing_measured_is_nan_in_the_summary_and_no_setting() -> None:
+    """Nor are commands that come at once."""
     seen = LinkStatistics()
     assert math.isnan(seen.summary()["latency_p999_ms"])
+    assert seen.latency_override() is None
+    seen.loop_times.append(0.0)
     assert seen.latency_override() is None
 
 
@@ -172,9 +170,3 @@ def test_the_override_is_a_word_that_cartpole_train_takes() -> None:
         config = validated(TrainConfig, compose("train", [f"randomization={group}", word]))
         assert config.randomization["latency"].limits() == (0.0021, 0.0119)
         assert randomizer(config).longest_delay() == pytest.approx(0.0119)
-
-
-def test_commands_that_come_at_once_leave_nothing_to_hand_on() -> None:
-    seen = LinkStatistics()
-    seen.loop_times.append(0.0)
-    assert seen.latency_override() is None
