@@ -143,7 +143,7 @@ def test_a_serial_cart_with_arbitrary_reports(script: Script, make_environment: 
         assert not sent or sent[-1] == 0
         if episode is not None:
             assert_sound(episode)
-            assert not any(motor_of(frame) for frame in peer.received[ended_at:])
+            assert not any(getattr(frame.message, "motor", 0) for frame in peer.received[ended_at:])
             finite = [all(map(math.isfinite, script.values[row])) for row in range(episode.steps)]
             assert all(motor == 0 or known for motor, known in zip(driving(peer), finite, strict=False))
 
@@ -160,11 +160,6 @@ def driving(peer: CartPeer) -> list[int]:
     messages = [frame.message for frame in peer.received]
     (start,) = (index for index, message in enumerate(messages) if isinstance(message, Start))
     return [message.motor for message in messages[start:] if isinstance(message, SetMotor)]
-
-
-def motor_of(frame: Frame) -> int:
-    """The motor value in a frame of the host, 0 in all but SET_MOTOR."""
-    return frame.message.motor if isinstance(frame.message, SetMotor) else 0
 
 
 def assert_sound(episode: Any) -> None:

@@ -3,6 +3,7 @@
 import math
 import pickle
 from collections.abc import Callable
+from functools import partial
 
 import pytest
 import torch
@@ -167,8 +168,12 @@ class TestDraws:
         assert len(plant.pole_length.unique()) == 2
 
 
-class TestSnapshot:
-    def course(self, plant: SimulatedPlant, motors: Tensor) -> Tensor:
+def test_a_snapshot_goes_on_as_if_nothing_had_happened_in_another_plant_too(make_plant: MakePlant) -> None:
+    delays = {"latency": Range(absolute=(0.0, 0.04)), "motor_time_constant": Range(absolute=(0.0, 0.05))}
+    stribeck = Models(CART_FRICTIONS.find("stribeck"))
+    build = partial(make_plant, 4, ranges={**NOISY, **delays}, start=ANYWHERE, models=stribeck)
+
+    def course(plant: SimulatedPlant, motors: Tensor) -> Tensor:
         """Counts [T, N] with resets on the way."""
         frames = []
         for index, row in enumerate(motors):
@@ -177,31 +182,14 @@ class TestSnapshot:
                 reset_rows(plant, index % plant.carts)
         return torch.stack(frames)
 
-    @pytest.fixture
-    def settings(self) -> dict:
-        ranges = {
-            **NOISY,
-            "latency": Range(absolute=(0.0, 0.04)),
-            "motor_time_constant": Range(absolute=(0.0, 0.05)),
-        }
-        return {
-            "carts": 4,
-            "ranges": ranges,
-            "start": ANYWHERE,
-            "models": Models(CART_FRICTIONS.find("stribeck")),
-        }
-
-    def test_goes_on_as_if_nothing_had_happened_in_another_plant_too(
-        self, make_plant: MakePlant, settings: dict
-    ) -> None:
-        plant, motors = make_plant(**settings), random_motors(60, 4)
-        plant.reset()
-        self.course(plant, motors[:30])
-        snapshot = plant.snapshot()
-        first = self.course(plant, motors[30:])
-        for again in (plant, make_plant(**settings, seed=99)):
-            again.restore(snapshot)
-            assert (self.course(again, motors[30:]) == first).all()
+    plant, motors = build(), random_motors(60, 4)
+    plant.reset()
+    course(plant, motors[:30])
+    snapshot = plant.snapshot()
+    first = course(plant, motors[30:])
+    for again in (plant, build(seed=99)):
+        again.restore(snapshot)
+        assert (course(again, motors[30:]) == first).all()
 
 
 def test_a_pickled_plant_reads_the_carts_that_it_draws(make_plant: MakePlant) -> None:

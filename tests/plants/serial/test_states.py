@@ -130,8 +130,8 @@ def test_states_lost_before_the_first_info_are_no_matter() -> None:
 
 def test_a_clock_that_may_have_wrapped_unseen_is_believed() -> None:
     """A person may take an hour to answer a question; nobody reads states meanwhile."""
-    for minutes in (30, 71, 75, 140):
-        with CartPeer(paced=True) as peer, SerialCart(quick_settings(peer.port)) as cart:
+    with CartPeer(paced=True) as peer, SerialCart(quick_settings(peer.port)) as cart:
+        for minutes in (30, 71, 75, 140):
             peer.tick()
             before = cart.get_state()
             ticks = minutes * 60 * 50
