@@ -5,7 +5,7 @@ as well. Carts are drawn as in any simulated plant; the learned residual is adde
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -154,13 +154,7 @@ class LearnedPlant(SimulatedPlant):
             missing = self._carts.drive.new_zeros(1 + memory - len(self._carts.drive), carts)
             self._carts = self._carts._replace(drive=torch.cat((self._carts.drive, missing)))
         self._residual = Residual(*(part.to(self.device) for part in model.residual))
-        run = partial(
-            run_learned_carts,
-            models=model.models,
-            period=model.period,
-            substeps=model.substeps,
-            encoders=self.hardware.encoders,
-        )
+        run: Callable[..., Period] = partial(run_learned_carts, **self._plain_run.keywords)
         self._run_learned = Compiled(run) if compiled else run
         self._run = self._run_members
 

@@ -66,21 +66,18 @@ class Plant(EnvBase):
         """`hardware` is that of the carts, ip02's if it is not given."""
         super().__init__(device=torch.device(device), batch_size=torch.Size([carts]))
         self.hardware = hardware or nominal_hardware()
-        self.action_spec = Composite(
-            motor=Bounded(-LARGEST_MOTOR, LARGEST_MOTOR, shape=(carts, 1), dtype=torch.int64, device=device),
-            shape=(carts,),
-        )
+        single: dict[str, Any] = {"shape": (carts, 1), "device": device}
+        motor = Bounded(-LARGEST_MOTOR, LARGEST_MOTOR, dtype=torch.int64, **single)
+        self.action_spec = Composite(motor=motor, shape=(carts,))
         self.observation_spec = Composite(
             counts=Unbounded(shape=(carts, 2), dtype=torch.int64, device=device),
-            dt=Unbounded(shape=(carts, 1), dtype=torch.float32, device=device),
-            motor_applied=Bounded(
-                -LARGEST_MOTOR, LARGEST_MOTOR, shape=(carts, 1), dtype=torch.int64, device=device
-            ),
+            dt=Unbounded(dtype=torch.float32, **single),
+            motor_applied=motor.clone(),
             shape=(carts,),
         )
-        self.reward_spec = Unbounded(shape=(carts, 1), device=device)
+        self.reward_spec = Unbounded(**single)
         self.done_spec = Composite(
-            {key: Binary(shape=(carts, 1), dtype=torch.bool, device=device) for key in DONE_KEYS},
+            {key: Binary(dtype=torch.bool, **single) for key in ("done", "terminated", "truncated")},
             shape=(carts,),
         )
 
@@ -116,12 +113,7 @@ class Plant(EnvBase):
 
     def link_figures(self) -> dict[str, Any]:
         """Return the counts of lost, damaged and late frames."""
-        link = self.statistics
-        return {
-            "late_ticks": link.late_ticks,
-            "lost_frames": link.lost_frames,
-            "bad_frames": link.bad_frames,
-        }
+        return {name: getattr(self.statistics, name) for name in ("late_ticks", "lost_frames", "bad_frames")}
 
     def check_policy(self, identity: int) -> None:
         """Raise PlantError unless the cart's board has the agent of this `identity`."""
@@ -236,5 +228,4 @@ def on_tensors(frame: PlantOutput[Numbers]) -> PlantOutput[torch.Tensor]:
     return PlantOutput(*map(torch.from_numpy, columns))
 
 
-DONE_KEYS = ("done", "terminated", "truncated")
 TYPES: tuple[type[np.generic], ...] = (np.int64, np.float32, np.int64, np.bool_, np.bool_)  # of an output

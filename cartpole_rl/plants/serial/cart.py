@@ -251,7 +251,8 @@ class SerialCart:
             except RefusedError as error:
                 if error.reason != Reason.BUSY:
                     raise
-                if self._is_homing():
+                self.poll_state()
+                if self.flags & Flags.HOMING:
                     break  # only the ACK was lost
                 if self.flags & Flags.ARMED or now() > deadline:
                     raise  # otherwise its brake acts, after STOP
@@ -393,10 +394,6 @@ class SerialCart:
                 f"this computer did not answer the cart on {self.port} for {seconds:.1f} s, or heard nothing "
                 "of it: end what keeps it busy, do not suspend a command that drives, check the cable"
             )
-
-    def _is_homing(self) -> bool:
-        self.poll_state()
-        return bool(self.flags & Flags.HOMING)
 
     def _note(self, information: Info) -> Info:
         self._information = information
