@@ -7,8 +7,6 @@ import pytest
 import serial
 from serial_peer import CartPeer
 
-from cartpole_rl.checking import validated
-from cartpole_rl.composition import compose
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import ConfigError, LinkError, PlantError
 from cartpole_rl.plants.settings import SerialSettings
@@ -28,8 +26,8 @@ TIMEOUTS = {
 
 
 def evaluation(**plant: object) -> EvaluateConfig:
-    values = compose("evaluate", {"run": "lqr", "plant": "serial"})
-    return validated(EvaluateConfig, {**values, "plant": values["plant"] | plant})
+    overrides = {f"plant.{name}": value for name, value in plant.items()}
+    return load_settings(EvaluateConfig, {"run": "lqr", "plant": "serial", **overrides})
 
 
 def environment(config: EvaluateConfig) -> CartPoleEnv:
