@@ -87,12 +87,13 @@ class Evaluation:
 
     def episodes(self) -> Iterator[Episode]:
         """Drive the repeated episode, or new ones, and yield each as it ends."""
+        knocks = Knocks(self.env.plant, self.config.knock) if self.config.knock else None
         if self.repetition:
-            again = repeated(self.env, self.policy, self.repetition, self.knocks)
+            again = repeated(self.env, self.policy, self.repetition, knocks)
             yield from self._shown(again, "episodes", self.repetition.row)
-            return
-        count = self.config.episodes
-        yield from self._shown(run_episodes(self.env, self.policy, count, self.knocks), "episodes")
+        else:
+            driven = run_episodes(self.env, self.policy, self.config.episodes, knocks)
+            yield from self._shown(driven, "episodes")
 
     def print_notes(self, command: str) -> None:
         """Print what differs from the training, and the numbers of a simulated cart that are not nominal."""
@@ -129,11 +130,6 @@ class Evaluation:
                     progress.set_postfix_str(score, refresh=False)
                     progress.update()
                     yield episode
-
-    @property
-    def knocks(self) -> Knocks | None:
-        """The knocks of the simulated poles; None for none."""
-        return Knocks(self.env.plant, self.config.knock) if self.config.knock else None
 
 
 @waiting("preparing the cart and its track guard")
@@ -216,8 +212,7 @@ def agent_on_board(config: EvaluateConfig, trained: TrainedAgent, settings: Cart
     """Return the agent that the board should have: on an emulated cart, one with `settings`."""
     if config.plant.has_compiled_agent:
         return trained
-    shared = {name: getattr(settings, name) for name in CartPoleSettings.model_fields}
-    return TrainedAgent(trained.training.model_copy(update=shared), trained.policy)
+    return TrainedAgent(trained.training.model_copy(update=dict(settings)), trained.policy)
 
 
 def check_compiled_settings(trained: TrainedAgent, settings: CartPoleSettings) -> None:

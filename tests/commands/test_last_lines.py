@@ -11,6 +11,8 @@ from command_line import COARSE, Outcome, in_process
 
 from cartpole_rl.command import wrapped
 from cartpole_rl.composition import reading_conf
+from cartpole_rl.plants.serial.tracking import LinkStatistics
+from cartpole_rl.terminal import print_loop_time
 
 pytestmark = pytest.mark.usefixtures("without_pictures")
 SIMULATED = "cartpole-evaluate run=run plant=emulated"
@@ -26,15 +28,22 @@ def compose(command: str) -> None:
 
 @pytest.mark.parametrize(
     ("words", "following"),
-    [(("plant=simulated",), SIMULATED), (("plant=emulated", COARSE), EMULATED)],
+    [
+        (("plant=simulated",), SIMULATED),
+        (("plant=emulated", COARSE), EMULATED),
+        (("pole=large",), f"{SIMULATED} emulator=large"),
+    ],
 )
 def test_an_evaluation_leads_to_the_cart(words: tuple[str, ...], following: str, trained: Path) -> None:
+    """And tells of another pole than the agent's."""
     name = f"last_{words[0].partition('=')[2]}"
     words = ("run=run", "episodes=1", *words, f"hydra.run.dir={name}")
     done = in_process("evaluate", *words, folder=trained.parent)
     *_, written, last = done.out.splitlines()
     assert written == f"{name}/metrics.json and figures/ are written; next:"
     assert last == following
+    other = "the agent was trained with a pole of 0.36 m, the cart has one of 0.66 m" in done.err
+    assert other == ("pole=large" in words)
     compose(last)
 
 
@@ -47,16 +56,22 @@ def test_an_agent_on_another_pole_is_told_which_cart_has_its_own(tmp_path: Path)
     compose(last)
 
 
-def test_a_chosen_pole_is_kept(trained: Path) -> None:
-    done = in_process("evaluate", "run=run", "episodes=1", "pole=large", folder=trained.parent)
-    assert "the agent was trained with a pole of 0.36 m, the cart has one of 0.66 m" in done.err
-    assert done.out.splitlines()[-1] == "cartpole-evaluate run=run plant=emulated emulator=large"
-
-
 def test_a_fine_tuning_leads_to_an_evaluation_on_its_cart(tuned: tuple[Path, Outcome]) -> None:
     *_, written, last = tuned[1].out.splitlines()
     assert written.startswith("run/metrics.json, comparison.json, checkpoints/last.pt and recordings/ are")
     assert last == "cartpole-evaluate run=run plant=emulated emulator.physics_step=0.001"
+
+
+def test_a_measured_loop_time_is_printed_with_what_it_lacks(capsys: pytest.CaptureFixture[str]) -> None:
+    statistics = LinkStatistics()
+    print_loop_time(statistics.latency_override())
+    assert capsys.readouterr().out == ""
+    statistics.loop_times.append(0.004)
+    print_loop_time(statistics.latency_override())
+    assert capsys.readouterr().out == (
+        "measured loop time as an override of cartpole-train; add the latency that cartpole-preflight prints "
+        "to both numbers: '++randomization.latency={distribution: uniform, absolute: [0.004, 0.004]}'\n"
+    )
 
 
 class Narrow(io.StringIO):

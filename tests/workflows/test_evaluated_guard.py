@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from cartpole_rl.envs.build import with_fitted_guard
+from cartpole_rl.envs.settings import CartPoleSettings
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.workflows.build import evaluated_settings, guard_note
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig, load_settings
@@ -18,12 +19,18 @@ def fitted(**overrides: object) -> TrainConfig:
     return with_fitted_guard(load_settings(TrainConfig, {"guard": "careful", **overrides}))
 
 
+def evaluated(training: TrainConfig, **overrides: object) -> tuple[CartPoleSettings, str | None]:
+    """The settings of an evaluation, and the note about its guard."""
+    evaluation = load_settings(EvaluateConfig, {"run": "any", **overrides})
+    settings = evaluated_settings(training, evaluation)
+    return settings, guard_note(training, evaluation, settings)
+
+
 @pytest.mark.parametrize("of_training", [True, False])
 def test_a_chosen_one_is_fitted_to_the_carts_of_the_training_or_of_the_evaluation(of_training: bool) -> None:
     carts = {"randomization": "half"}
     training = load_settings(TrainConfig, {"guard": "none", **(carts if of_training else {})})
-    evaluated = {"run": "any", "guard": "careful", **({} if of_training else carts)}
-    settings = evaluated_settings(training, load_settings(EvaluateConfig, evaluated))
+    settings, _ = evaluated(training, guard="careful", **({} if of_training else carts))
     assert settings.guard.active == fitted(**carts).guard.active
     assert (settings.randomization == {}) == of_training
 
@@ -37,7 +44,7 @@ def with_motors(motors: tuple[int, ...]) -> dict[str, object]:
 
 
 @pytest.mark.parametrize(
-    "evaluated",
+    "given",
     [
         {"parameters": {"cart_mass": 0.8}, "randomization": "half"},
         with_motors(SAME_ENDS),
@@ -45,32 +52,23 @@ def with_motors(motors: tuple[int, ...]) -> dict[str, object]:
     ],
     ids=["other carts", "motor values with the same ends", "policy on a board"],
 )
-def test_the_guard_of_the_training_stays(evaluated: dict[str, object]) -> None:
-    training, evaluation = fitted(), load_settings(EvaluateConfig, {"run": "any", **evaluated})
-    settings = evaluated_settings(training, evaluation)
-    assert settings.guard == training.guard
-    assert guard_note(training, evaluation, settings) is None
-
-
-@pytest.mark.parametrize("plant", [{}, SERIAL])
-def test_it_is_fitted_anew_to_other_full_motor_values(plant: dict[str, object]) -> None:
+def test_the_guard_of_the_training_stays(given: dict[str, object]) -> None:
     training = fitted()
-    evaluation = load_settings(EvaluateConfig, {"run": "any", **plant, **with_motors(WEAK)})
-    settings = evaluated_settings(training, evaluation)
+    settings, note = evaluated(training, **given)
+    assert (settings.guard, note) == (training.guard, None)
+
+
+@pytest.mark.parametrize("cart", [SERIAL, {"parameters": {"cart_mass": 0.9}, "randomization": "half"}])
+def test_it_is_fitted_anew_to_other_full_motor_values(cart: dict[str, object]) -> None:
+    """A simulated cart does not tell it its parameters: it is that of the carts of the training."""
+    training = fitted()
+    settings, note = evaluated(training, **cart, **with_motors(WEAK))
     numbers = fitted(**with_motors(WEAK)).guard.active
     assert numbers.deceleration < 0.8 * training.guard.active.deceleration
     assert settings.guard.active == numbers
-    assert guard_note(training, evaluation, settings) == (
+    assert note == (
         f"note: the track guard of the training is for other full motor values; fitted anew: {numbers}"
     )
-
-
-def test_a_simulated_cart_does_not_tell_its_parameters_to_the_new_guard() -> None:
-    """It is that of the carts of the training, as on a real cart."""
-    unknown = {"parameters": {"cart_mass": 0.9}, "randomization": "half"}
-    evaluation = load_settings(EvaluateConfig, {"run": "any", **unknown, **with_motors(WEAK)})
-    settings = evaluated_settings(fitted(), evaluation)
-    assert settings.guard.active == fitted(**with_motors(WEAK)).guard.active
 
 
 @pytest.mark.parametrize(
@@ -85,14 +83,11 @@ def test_a_simulated_cart_does_not_tell_its_parameters_to_the_new_guard() -> Non
 def test_it_is_fitted_anew_to_a_pole_that_was_not_in_training(
     trained: str, cart: dict[str, object], fitted_to: str
 ) -> None:
-    training, evaluation = fitted(pole=trained), load_settings(EvaluateConfig, {"run": "any", **cart})
-    settings = evaluated_settings(training, evaluation)
+    settings, note = evaluated(fitted(pole=trained), **cart)
     numbers = fitted(pole=fitted_to).guard.active
     assert settings.guard.active == numbers
     line = "note: the track guard of the training is for another pole; fitted anew to 0.66 m, 0.23 kg: "
-    assert guard_note(training, evaluation, settings) == (
-        None if fitted_to == trained else f"{line}{numbers}"
-    )
+    assert note == (None if fitted_to == trained else f"{line}{numbers}")
 
 
 def test_identified_carts_carry_the_other_pole_when_it_is_fitted_anew(tmp_path: Path) -> None:
@@ -104,8 +99,7 @@ def test_identified_carts_carry_the_other_pole_when_it_is_fitted_anew(tmp_path: 
     np.savez(tmp_path / "posterior.npz", names=names, carts=carts, identified=names)
     of_one_cart = {"posterior": tmp_path / "posterior.npz", "widen": 1.0, "prior_share": 0.0, "ranges": {}}
     training = fitted(randomization=of_one_cart)
-    evaluation = load_settings(EvaluateConfig, {"run": "any", **SERIAL, "plant.pole_length": 0.66})
-    numbers = evaluated_settings(training, evaluation).guard.active
+    numbers = evaluated(training, **SERIAL, **{"plant.pole_length": 0.66})[0].guard.active
     assert numbers == fitted(randomization=of_one_cart, pole="large").guard.active
     assert numbers.delay > 1.1 * training.guard.active.delay
 
@@ -120,15 +114,12 @@ def test_it_is_fitted_anew_to_a_heavier_pole_of_the_same_length(
     """Rods of 0.36 m have 0.25 kg in training."""
     pole = {"choices": {"mine": {"pole_mass": mass, "pole_com": 0.1778, "pole_inertia": 2e-3}}}
     training = fitted(pole=trained, randomization="half")
-    evaluation = load_settings(EvaluateConfig, {"run": "any", **SERIAL, "pole": pole})
-    settings = evaluated_settings(training, evaluation)
-    assert (settings.guard != training.guard) == is_refitted
-    assert bool(guard_note(training, evaluation, settings)) == is_refitted
+    settings, note = evaluated(training, **SERIAL, pole=pole)
+    assert (settings.guard != training.guard) == bool(note) == is_refitted
 
 
 @pytest.mark.parametrize("chosen", [{"guard": "none"}, {"guard.numbers": GIVEN, "guard": "careful"}])
 def test_a_chosen_guard_is_not_replaced(chosen: dict[str, object]) -> None:
-    evaluation = load_settings(EvaluateConfig, {"run": "any", **chosen, **with_motors(WEAK)})
-    settings = evaluated_settings(fitted(), evaluation)
-    assert settings.guard == evaluation.guard
-    assert guard_note(fitted(), evaluation, settings) is None
+    settings, note = evaluated(fitted(), **chosen, **with_motors(WEAK))
+    assert settings.guard == load_settings(EvaluateConfig, {"run": "any", **chosen}).guard
+    assert note is None

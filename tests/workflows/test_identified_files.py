@@ -1,4 +1,4 @@
-"""The files of an identification give each number exactly, with the unit that conf/ gives it."""
+"""What an identification writes: each number exactly, with its unit, and errors where the truth is known."""
 
 import shlex
 from pathlib import Path
@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import yaml
 
+from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.identification.fit import Fit
 from cartpole_rl.identification.identify import Candidate, Identification, PredictionError
 from cartpole_rl.identification.rollout import Dynamics
@@ -16,7 +17,7 @@ from cartpole_rl.physics.models import Models
 from cartpole_rl.randomization.poles import Pole
 from cartpole_rl.rig.hardware import nominal_hardware
 from cartpole_rl.rig.parameters import POSITIVE, Parameter, factor
-from cartpole_rl.workflows.identify import friction_choice, write_choices
+from cartpole_rl.workflows.identify import errors, friction_choice, write_choices
 
 HARDWARE = nominal_hardware().model_copy(update={"track_span": 0.5, "pole_counts_per_turn": 2400})
 
@@ -56,3 +57,26 @@ def test_a_law_of_a_user_has_a_file_with_the_parameters_that_it_brings(
     assert shlex.split(friction_choice(models.cart_friction, Path("my id"))) == [
         'cart_friction="my id/cart_friction.yaml"'
     ]
+
+
+TRUTH = EmulatorSettings(
+    cart_coulomb_left=0.4, cart_coulomb_right=0.6, force_curve=(0.0, 0.02, -1.0), force_asymmetry=0.0
+)
+EXACT = {
+    **TRUTH.model_dump(include={"cart_mass", "pole_mass", "pole_com", "cart_viscous", "pole_viscous"}),
+    "cart_coulomb": 0.5,
+    "force_quadratic": 0.0,
+    "force_linear": 0.02,
+    "force_offset": -1.0,
+    "force_asymmetry": 0.0,
+}
+
+
+def test_an_error_is_relative_to_the_truth_of_what_was_estimated() -> None:
+    assert set(errors(EXACT, TRUTH)["errors"].values()) == {0.0}
+    other = {**EXACT, "cart_viscous": 0.0, "cart_mass": 1.5 * TRUTH.cart_mass}
+    found = errors(other, TRUTH, {"cart_viscous"})["errors"]
+    assert "cart_viscous" not in found
+    assert found["cart_mass"] == pytest.approx(0.5)
+    assert found["median"] == 0
+    assert errors(EXACT, None) == {}

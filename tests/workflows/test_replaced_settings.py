@@ -1,34 +1,34 @@
-"""An evaluation can replace settings of the training: motor values, and the pole by its length."""
+"""The settings of an evaluation: those that replace the training's, and those of a repeated episode."""
+
+from pathlib import Path
 
 import pytest
 
 from cartpole_rl.agents.baseline import regulator
+from cartpole_rl.choices import choice
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.physics.parameters import cart_column
 from cartpole_rl.rig.hardware import hardware_of
+from cartpole_rl.tasks.episode import Origin
 from cartpole_rl.tasks.settings import ActionSettings
 from cartpole_rl.workflows.build import evaluated_agent, evaluated_settings, replaced_settings
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig, load_settings
-
-
-def test_another_number_of_them_is_refused() -> None:
-    config = load_settings(EvaluateConfig, {"run": "somewhere", "actions": "three"})
-    with pytest.raises(ConfigError, match=r"^actions: 3 motor values, but the agent chooses from 9; give 9$"):
-        replaced_settings(load_settings(TrainConfig), config)
+from cartpole_rl.workflows.episodes import same_evaluation
 
 
 @pytest.mark.parametrize(
-    "motors",
+    ("motors", "complaint"),
     [
-        [250, 200, 150, 100, 0, -100, -150, -200, -250],
-        [-250, -200, -150, 0, -100, 100, 150, 200, 250],
-        [-250, -200, -150, -100, 10, 100, 150, 200, 250],
+        ([-250, 0, 250], r"^actions: 3 motor values, but the agent chooses from 9; give 9$"),
+        ([250, 200, 150, 100, 0, -100, -150, -200, -250], "would push in other directions than in its"),
+        ([-250, -200, -150, 0, -100, 100, 150, 200, 250], "would push in other directions than in its"),
+        ([-250, -200, -150, -100, 10, 100, 150, 200, 250], "would push in other directions than in its"),
     ],
 )
-def test_values_that_push_in_other_directions_are_refused(motors: list[int]) -> None:
-    config = load_settings(EvaluateConfig, {"run": "somewhere", "actions": "nine_levels"})
+def test_motor_values_of_another_meaning_are_refused(motors: list[int], complaint: str) -> None:
+    config = load_settings(EvaluateConfig, {"run": "somewhere"})
     config = config.model_copy(update={"actions": ActionSettings(motors=motors, actuator="force_curve")})
-    with pytest.raises(ConfigError, match="the agent would push in other directions than in its training"):
+    with pytest.raises(ConfigError, match=complaint):
         replaced_settings(load_settings(TrainConfig), config)
 
 
@@ -55,13 +55,11 @@ def test_motor_values_are_replaced() -> None:
 
 def test_an_agent_of_another_rig_is_refused() -> None:
     training = load_settings(TrainConfig, {"cart.track_span": 0.78})
-    for run, refused in (("somewhere", True), ("lqr", False)):
-        config = load_settings(EvaluateConfig, {"run": run, "cart": "ip02"})
-        if refused:
-            with pytest.raises(ConfigError, match=r"0\.814 m of track, but .* 0\.78 m of track; train one"):
-                replaced_settings(training, config)
-        else:
-            assert replaced_settings(training, config).hardware.track_span == 0.814
+    config = load_settings(EvaluateConfig, {"run": "somewhere", "cart": "ip02"})
+    with pytest.raises(ConfigError, match=r"0\.814 m of track, but .* 0\.78 m of track; train one"):
+        replaced_settings(training, config)
+    baseline = config.model_copy(update={"run": Path("lqr")})
+    assert replaced_settings(training, baseline).hardware.track_span == 0.814
 
 
 def test_the_baseline_is_computed_for_the_cart_and_the_period_that_it_drives() -> None:
@@ -88,3 +86,20 @@ def test_a_learned_model_has_its_own_rig() -> None:
     learned = {"run": "lqr", "plant": "learned", "plant.model": "model", "cart": "stepper"}
     with pytest.raises(ConfigError, match=r"^cart: plant=learned"):
         load_settings(EvaluateConfig, learned)
+
+
+GUARD = {**choice("guard/fitted"), "numbers": {"margin": 0.05, "delay": 0.2, "deceleration": 2.0}}
+POLE = {"pole_mass": 0.127, "pole_com": 0.1778, "pole_inertia": 0.001199}
+
+
+@pytest.mark.parametrize(
+    ("run", "same"),
+    [("runs/a", True), (f"{Path.cwd()}/runs/a", True), ("runs/../runs/a", True), ("runs/b", False)],
+)
+def test_the_same_agent_has_the_guard_of_then_however_its_folder_is_spelt(run: str, same: bool) -> None:
+    former = load_settings(EvaluateConfig, {"run": "runs/a", "pole": "both"})
+    recorded = {**former.model_dump(mode="json"), "evaluated": {"guard": GUARD}}
+    config = load_settings(EvaluateConfig, {"run": run})
+    repeated = same_evaluation(config, recorded, Origin({**POLE, "cart_mass": 0.7}, {}))
+    assert repeated.run == Path(run)
+    assert (repeated.guard is not None) == same

@@ -1,11 +1,17 @@
-"""Which poles an agent knows, and which emulated cart has one of them."""
+"""Which poles an agent knows, and the words that choose a cart."""
+
+import shlex
+from pathlib import Path
 
 import pytest
 
 from cartpole_rl.choices import choice, group_choices
+from cartpole_rl.plants.settings import SerialSettings
 from cartpole_rl.randomization.poles import Pole, PoleSettings, one_pole, pole_of_length
+from cartpole_rl.run_folder import write_config
 from cartpole_rl.workflows.build import with_shaking_pole
-from cartpole_rl.workflows.poles import emulated_words, other_pole
+from cartpole_rl.workflows.config import IdentifyConfig, load_settings
+from cartpole_rl.workflows.poles import emulated_words, other_pole, plant_words, words_of_run
 
 POLES = group_choices("pole")
 MEDIUM, LARGE, BOTH = (PoleSettings(**POLES[name]) for name in ("medium", "large", "both"))
@@ -66,3 +72,36 @@ def test_the_pole_that_shakes_a_cart_most_has_the_longest_lever() -> None:
     }
     numbers = with_shaking_pole(choice("cart/laboratorio"), PoleSettings(choices=choices))
     assert (numbers["pole_mass"], numbers["pole_com"]) == poles["long"]
+
+
+def test_the_words_for_a_cart_keep_its_line_speed_and_its_pole() -> None:
+    assert plant_words(SerialSettings(port="COM3")) == "plant=serial plant.port=COM3"
+    assert plant_words(SerialSettings(port="COM3", policy="onboard")) == "plant=serial plant.port=COM3"
+    other = SerialSettings(port="COM3", baud=115200, pole_length=0.66)
+    assert plant_words(other) == "plant=serial plant.port=COM3 plant.baud=115200 plant.pole_length=0.66"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "plant=emulated",
+        "plant=emulated emulator=large emulator.cart_viscous=2.0",
+        "plant=emulated emulator=stand_in plant.rehome=always",
+        "plant=emulated emulator.clock=real 'emulator.force_curve=[0.0,0.02,-0.9]'",
+        "plant=serial plant.port=COM3 plant.clear_faults=2",
+    ],
+)
+def test_the_words_for_a_cart_and_for_the_cart_of_a_run_choose_the_same_cart(
+    words: str, tmp_path: Path
+) -> None:
+    given = {key: value for key, _, value in (word.partition("=") for word in shlex.split(words))}
+    config = load_settings(IdentifyConfig, shlex.split(words))
+    found = plant_words(config.plant, config.emulator)
+    assert load_settings(IdentifyConfig, shlex.split(found)).plant == config.plant
+    assert load_settings(IdentifyConfig, shlex.split(found)).emulator == config.emulator
+    assert {word.partition("=")[0] for word in shlex.split(found)} == given.keys()
+    identified, imported = tmp_path / "a", tmp_path / "b"
+    write_config(identified, "identify", config.model_dump(mode="json", by_alias=True))
+    write_config(imported, "identify", {"seed": 0, "from": str(identified)})
+    assert words_of_run(imported) == found
+    assert words_of_run(tmp_path) is None

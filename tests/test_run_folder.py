@@ -1,11 +1,11 @@
-"""The recordings that a folder or a run folder holds."""
+"""The recordings that a folder holds, and what a run knows of the runs that it needs."""
 
 from pathlib import Path
 
 import pytest
 
 from cartpole_rl.errors import RecordingError
-from cartpole_rl.run_folder import experiments, recordings
+from cartpole_rl.run_folder import experiments, is_outdated, recordings, write_inputs
 
 
 def write(folder: Path, *names: str) -> list[Path]:
@@ -37,3 +37,18 @@ def test_no_recording_takes_the_name_of_another(tmp_path: Path) -> None:
 def test_a_source_without_recordings_is_refused(tmp_path: Path, name: str, missing: str) -> None:
     with pytest.raises(RecordingError, match=f"{missing}; give a run of cartpole-record"):
         recordings(tmp_path / name)
+
+
+@pytest.mark.parametrize("result", ["identification.json", "model.json", "checkpoints/last.pt"])
+def test_a_need_that_was_made_again_outdates_it(result: str, tmp_path: Path) -> None:
+    run, need, moved = tmp_path / "agents/ours/10", tmp_path / "carts/stand_in/10", tmp_path / "moved"
+    run.mkdir(parents=True)
+    (need / result).parent.mkdir(parents=True)
+    (need / result).write_text("3.1")
+    assert not is_outdated(run)  # nothing is known of a run without the file
+    write_inputs(run, [need])
+    assert not is_outdated(run)
+    (need / result).write_text("3.2")
+    assert is_outdated(run)
+    need.rename(moved)  # as where one study was copied without the others
+    assert not is_outdated(run)
