@@ -12,7 +12,9 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Callable
+from operator import attrgetter
 from pathlib import Path
+from typing import Any
 
 from cartpole_rl.emulator.firmware import MOST_PENDING
 from cartpole_rl.emulator.guards import LEVER, micrometres
@@ -62,8 +64,19 @@ class CartHead(ctypes.Structure):
     )
 
 
+def of_head(name: str) -> Any:
+    """Return a property that is a field of the cart's head."""
+    return property(attrgetter(f"_head.{name}"), lambda cart, value: setattr(cart._head, name, value))
+
+
 class CFirmware:
     """The C firmware of one cart, just booted: idle, not homed, motor 0. Times are us since boot."""
+
+    period_us: int = of_head("period_us")  # of the next period
+    armed: bool = of_head("armed")  # the cart obeys SET_MOTOR
+    homed: bool = of_head("homed")  # the zeros are set
+    homing: bool = of_head("homing")
+    switches: int = of_head("switches")  # end switches that are pressed, as bits; set it before each `look`
 
     def __init__(
         self,
@@ -92,42 +105,9 @@ class CFirmware:
         self.carried_out: Message | None = None  # the newest message; None if it was refused or damaged
 
     @property
-    def period_us(self) -> int:
-        """The length of the next period."""
-        return self._head.period_us
-
-    @property
-    def armed(self) -> bool:
-        """True while the cart obeys SET_MOTOR."""
-        return self._head.armed
-
-    @property
-    def homed(self) -> bool:
-        """True if the zeros are set."""
-        return self._head.homed
-
-    @homed.setter
-    def homed(self, homed: bool) -> None:
-        self._head.homed = homed
-
-    @property
-    def homing(self) -> bool:
-        """True while the cart is homing."""
-        return self._head.homing
-
-    @property
     def fault(self) -> Fault:
         """The latched faults."""
         return Fault(self._head.fault)
-
-    @property
-    def switches(self) -> int:
-        """The end switches that are pressed, as bits: 1 left, 2 right. Set it before each `look`."""
-        return self._head.switches
-
-    @switches.setter
-    def switches(self, switches: int) -> None:
-        self._head.switches = switches
 
     @property
     def snapshot(self) -> list[int]:

@@ -72,12 +72,7 @@ def guard_side(x: Number, x_dot: Number, track_end: Number | float, guard: Track
 
 
 def fitted_guard(
-    quantile: float,
-    draws: Draws,
-    motors: Sequence[int],
-    models: Models,
-    period: float,
-    track_end: float,
+    quantile: float, draws: Draws, motors: Sequence[int], models: Models, period: float, track_end: float
 ) -> TrackGuard:
     """Return the guard that a share `quantile` of the carts of `draws` obeys in time.
 

@@ -222,22 +222,14 @@ def test_another_value_sends_other_bytes(base, name):
 
 
 def test_every_setting_is_tried_here_or_on_the_wire():
-    on_the_wire = {"clock", "frame_loss", "frame_corruption"}  # test_process.py
-    order = {"frame_duplication", "frame_reordering"}  # test_disturbance.py
-    faults = {"unplug_at", "stuck_encoder", "stuck_at"}  # test_faults.py
-    rate = {"clock_rate"}  # below
-    cogging = {"cogging", "cogging_pitch"}  # test_physics.py
-    firmware = {
-        "firmware",
-        "policy",
-        "hardware",
-        "given",
-    }  # this module runs with both; test_onboard_policy.py, test_rigs.py
-    others = {"journal", "knock"}  # tests/plants/test_stops.py, tests/fuzz/test_soak.py; below
-    port = {"port"}  # tests/plants/serial/test_tcp.py
-    assert set(OTHER) | firmware | on_the_wire | order | faults | cogging | others | port | rate == set(
-        EmulatorSettings.model_fields
-    )
+    elsewhere = {"clock", "frame_loss", "frame_corruption"}  # test_process.py
+    elsewhere |= {"frame_duplication", "frame_reordering"}  # test_link.py
+    elsewhere |= {"unplug_at", "stuck_encoder", "stuck_at"}  # test_faults.py
+    elsewhere |= {"cogging", "cogging_pitch"}  # test_physics.py
+    elsewhere |= {"firmware", "policy", "hardware", "given"}  # test_onboard_policy.py, test_rigs.py
+    elsewhere |= {"journal", "port"}  # tests/plants/test_stops.py, tests/plants/serial/test_tcp.py
+    elsewhere |= {"clock_rate", "knock"}  # below
+    assert set(OTHER) | elsewhere == set(EmulatorSettings.model_fields)
 
 
 def test_a_fast_clock_makes_short_periods():

@@ -1,15 +1,15 @@
-"""Each guard alone, fed with counts: where it is silent, and the first period in which it is not."""
+"""Each guard alone, fed with counts: where it is silent, and the first period in which it is not.
+
+Those of homing, too: a window covers its whole time, even if a period was late or early; a held cart is seen.
+"""
 
 import math
+from itertools import pairwise
 
 import pytest
 
-from cartpole_rl.emulator.guards import (
-    PUSH_US,
-    SPEED_CHANGE,
-    FrozenCartWatch,
-    FrozenPoleWatch,
-)
+from cartpole_rl.emulator.guards import PUSH_US, SPEED_CHANGE, FrozenCartWatch, FrozenPoleWatch
+from cartpole_rl.emulator.homing import HeldWatch, Reading, Window
 from cartpole_rl.rig.hardware import hardware_of, nominal_hardware
 
 PERIOD = 62_500  # us
@@ -70,12 +70,51 @@ def test_a_pole_count_is_frozen_when_the_cart_speeds_up_and_slows_down() -> None
 
 @pytest.mark.parametrize(
     ("speeds", "poles"),
-    [
-        ([0, FAST, FAST], [5, 5, 5]),
-        ([0, 0.8 * SPEED_CHANGE, 0], [5, 5, 5]),
-        ([0, FAST, 0], [5, 7, 7]),
-    ],
+    [([0, FAST, FAST], [5, 5, 5]), ([0, 0.8 * SPEED_CHANGE, 0], [5, 5, 5]), ([0, FAST, 0], [5, 7, 7])],
     ids=["only faster", "too little", "two counts"],
 )
 def test_no_frozen_pole_count(speeds: list[float], poles: list[int]) -> None:
     assert not pole_encoder_frozen(speeds, poles)
+
+
+LENGTH = 400_000  # us
+TICK = 20_000
+
+
+def filled(periods: list[int]) -> list[bool]:
+    """Return after each period whether the window is full."""
+    window, full = Window(LENGTH), []
+    for number, us in enumerate(periods):
+        window.add(number % 2, us)
+        full.append(window.spread < math.inf)
+    return full
+
+
+@pytest.mark.parametrize("late", [TICK, 40_000, 200_000, 10_000_000])
+def test_a_late_period_does_not_fill_a_window_early(late: int) -> None:
+    periods = [TICK] * 5 + [late] + [TICK] * 20
+    assert filled(periods).index(True) * TICK == LENGTH
+
+
+def test_a_short_period_does_not_fill_a_window_early() -> None:
+    periods = [TICK] * 5 + [TICK // 2] + [TICK] * 40
+    assert sum(periods[1 : filled(periods).index(True) + 1]) >= LENGTH
+
+
+@pytest.mark.parametrize(
+    ("nanometres", "counts", "held"),  # 15 ms apart
+    [
+        (1_000_000, (0, 3, 6, 7), False),  # 0.12 m/s may look so
+        (22_750, (0, 132, 264, 300), False),
+        (22_750, (0, 132, 264, 264, 264), True),
+        (22_750, (0, 132, 132, 396, 396), False),  # of a board that sends each count twice
+        (22_750, (0, -132, -264, -264, -264), False),  # it ran the other way
+    ],
+)
+def test_a_travelling_cart_that_stops_at_once_is_held(
+    nanometres: int, counts: tuple[int, ...], held: bool
+) -> None:
+    watch = HeldWatch(RIG.model_copy(update={"cart_nanometres_per_count": nanometres}))
+    readings = [Reading(count, 0, 15_000) for count in counts]
+    found = [watch.is_held(*pair, direction=1, motor=0, travels=True) for pair in pairwise(readings)]
+    assert found == [False] * (len(counts) - 2) + [held]

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 from driven_cart import Driven
-from firmwares import answering, motors_over, needs_compiler
+from firmwares import Bench, needs_compiler
 
 from cartpole_rl.emulator.c_firmware import CFirmware, build_library, compile_c
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import EmulatorError
-from cartpole_rl.wire.frames import decode_frame, encode_frame
+from cartpole_rl.wire.frames import encode_frame
 from cartpole_rl.wire.messages import (
     Ack,
     Fault,
@@ -54,10 +54,11 @@ SHUTTLE = Path(__file__).parents[1] / "support" / "shuttle"
 PolicyInC = ctypes.CFUNCTYPE(ctypes.c_int16, ctypes.c_void_p, ctypes.POINTER(Observation))
 
 
-class Board:
+class Board(Bench):
     """A homed cart whose policy is a Python function and drives, unless `start` is another message."""
 
     def __init__(self, choose: Callable[[Observation], int], start: Message = START_POLICY) -> None:
+        super().__init__()
         self.observed: list[tuple[int, int, int, int, int, bool, bool, int]] = []
 
         def called(memory: int, pointer: "ctypes._Pointer[Observation]") -> int:
@@ -69,14 +70,7 @@ class Board:
         self.firmware = CFirmware(lambda: 0)
         self.firmware._head.policy = ctypes.cast(self._called, ctypes.c_void_p)
         self.firmware.homed = True
-        self.now_us = self.ticks = 0
         self.send(start)
-
-    def send(self, message: Message) -> Message | None:
-        """Send a message; return the answer, if any."""
-        frame = encode_frame(answering(self.ticks, message), 1)[:-1]
-        answers = self.firmware.receive(frame, self.now_us)
-        return decode_frame(answers[0][:-1]).message if answers else None
 
     def heard(self, cart: int = 0, pole: int = 0) -> tuple[State, Flags, int]:
         """Pass a period in which the host sends HELLO."""
@@ -85,12 +79,7 @@ class Board:
 
     def tick(self, cart: int = 0, pole: int = 0) -> tuple[State, Flags, int]:
         """Pass a period; return STATE, its flags, and the motor value in force after it."""
-        start_us, self.now_us = self.now_us, self.now_us + self.firmware.period_us
-        motors_over(self.firmware, start_us, self.now_us)
-        frame = decode_frame(self.firmware.tick(self.now_us, cart, pole)[-1][:-1])
-        assert isinstance(frame.message, State)
-        self.ticks += 1
-        return frame.message, Flags(frame.flags), self.firmware.motor
+        return *super().tick(cart, pole), self.firmware.motor
 
 
 def test_it_observes_each_period_and_chooses_after_state():
@@ -156,13 +145,14 @@ def test_start_takes_the_motor_over_with_motor_0():
 
 def test_it_is_refused_where_start_is_and_on_a_cart_that_the_host_drives():
     board = Board(lambda seen: 100, start=Start())
-    assert board.send(StartPolicy()) == Nack(1, MessageType.START_POLICY, Reason.BUSY)
+    assert board.send(START_POLICY) == Nack(1, MessageType.START_POLICY, Reason.BUSY)
     board.send(Stop())
-    assert board.send(StartPolicy()) == board.send(StartPolicy()) == Ack(1, MessageType.START_POLICY)
+    for sequence in (3, 4):
+        assert board.send(START_POLICY) == Ack(sequence, MessageType.START_POLICY)
     board.send(Stop())
     board.firmware.homed = False
-    assert board.send(StartPolicy()) == Nack(1, MessageType.START_POLICY, Reason.NOT_HOMED)
-    assert board.send(Start()) == Nack(1, MessageType.START, Reason.NOT_HOMED)
+    assert board.send(START_POLICY) == Nack(6, MessageType.START_POLICY, Reason.NOT_HOMED)
+    assert board.send(Start()) == Nack(7, MessageType.START, Reason.NOT_HOMED)
 
 
 def test_info_names_the_agent_on_the_board():

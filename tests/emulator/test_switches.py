@@ -65,34 +65,26 @@ def test_both_firmwares_find_the_same_ends(switches: int, place: float, period_u
         assert farthest < HALF + STOP_BEHIND
 
 
+LIES: dict[str, tuple[int, Callable[[float], int], Fault]] = {
+    "left dead": (LEFT, lambda x: 0, Fault.LEFT_SWITCH),
+    "right dead": (RIGHT, lambda x: 0, Fault.RIGHT_SWITCH),
+    "second dead": (BOTH, lambda x: LEFT * (x < -HALF), Fault.RIGHT_SWITCH),
+    "left stuck": (LEFT, lambda x: LEFT, Fault.LEFT_SWITCH),
+    "left stuck of both": (BOTH, lambda x: LEFT, Fault.LEFT_SWITCH),
+    "right stuck": (BOTH, lambda x: RIGHT, Fault.RIGHT_SWITCH),
+    "both stuck": (BOTH, lambda x: BOTH, Fault.LEFT_SWITCH | Fault.RIGHT_SWITCH),
+    "swapped": (BOTH, lambda x: RIGHT * (x < -HALF) + LEFT * (x > HALF), Fault.RIGHT_SWITCH),
+    "left on the way right": (BOTH, lambda x: LEFT * (x < -HALF or x > 0.1), Fault.LEFT_SWITCH),
+    "both at the right": (
+        BOTH,
+        lambda x: LEFT if x < -HALF else BOTH * (x > HALF),
+        Fault.LEFT_SWITCH | Fault.RIGHT_SWITCH,
+    ),
+}
+
+
 @each_firmware
-@pytest.mark.parametrize(
-    ("switches", "reading", "fault"),
-    [
-        (LEFT, lambda x: 0, Fault.LEFT_SWITCH),
-        (RIGHT, lambda x: 0, Fault.RIGHT_SWITCH),
-        (BOTH, lambda x: LEFT * (x < -HALF), Fault.RIGHT_SWITCH),
-        (LEFT, lambda x: LEFT, Fault.LEFT_SWITCH),
-        (BOTH, lambda x: LEFT, Fault.LEFT_SWITCH),
-        (BOTH, lambda x: RIGHT, Fault.RIGHT_SWITCH),
-        (BOTH, lambda x: BOTH, Fault.LEFT_SWITCH | Fault.RIGHT_SWITCH),
-        (BOTH, lambda x: RIGHT * (x < -HALF) + LEFT * (x > HALF), Fault.RIGHT_SWITCH),
-        (BOTH, lambda x: LEFT * (x < -HALF or x > 0.1), Fault.LEFT_SWITCH),
-        (BOTH, lambda x: LEFT if x < -HALF else BOTH * (x > HALF), Fault.LEFT_SWITCH | Fault.RIGHT_SWITCH),
-    ],
-    ids=[
-        "left dead",
-        "right dead",
-        "second dead",
-        "left stuck",
-        "left stuck of both",
-        "right stuck",
-        "both stuck",
-        "swapped",
-        "left on the way right",
-        "both at the right",
-    ],
-)
+@pytest.mark.parametrize(("switches", "reading", "fault"), LIES.values(), ids=LIES)
 def test_a_switch_that_lies_ends_homing(switches: int, reading: Callable[[float], int], fault: Fault) -> None:
     driven = Driven(**settings_of(switches))
     reads(driven, reading)

@@ -1,7 +1,8 @@
-"""The hardware transform over simulated carts: observations, memory, rewards, resets."""
+"""The hardware transform: observations, memory, rewards, resets; its specs are those of any plant."""
 
 import math
 from collections.abc import Callable
+from contextlib import closing
 from typing import Any
 
 import pytest
@@ -10,8 +11,11 @@ from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs.utils import check_env_specs
 
+from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
+from cartpole_rl.errors import ConfigError
 from cartpole_rl.physics.dynamics import State
+from cartpole_rl.plants.serial.plant import emulated_plant
 from cartpole_rl.randomization.ranges import Range
 from cartpole_rl.tasks.features import MOTOR_SCALE, Measured, ObservationKind, observe
 from cartpole_rl.tasks.rewards import Reward
@@ -53,6 +57,26 @@ def test_specs(
     env = simulated(3, {"start": ANYWHERE}, kind=kind, pole_length=pole_length, **past)
     check_env_specs(env)
     assert env.observation_spec["observation"].shape == (3, env.hardware.observation_settings.size)
+
+
+def test_specs_over_a_serial_cart_hold_and_are_those_over_a_simulated_one(
+    simulated: Simulated, make_environment: Callable[..., CartPoleEnv]
+) -> None:
+    observation = {"pole_length": True, "past_motors": 2, "past_velocities": 2}
+    with closing(emulated_plant(EmulatorSettings(physics_step=1e-3))) as plant:
+        over_serial, over_simulated = make_environment(plant, **observation), simulated(**observation)
+        for one, other in ((plant, over_simulated.plant), (over_serial, over_simulated)):
+            assert (one.input_spec, one.output_spec) == (other.input_spec, other.output_spec)
+        check_env_specs(over_simulated)
+        check_env_specs(over_serial)
+
+
+def test_no_environment_is_moved_to_another_device(simulated: Simulated) -> None:
+    """Its specs would move, its carts would not."""
+    env = simulated()
+    assert env.to("cpu").device == env.device
+    with pytest.raises(ConfigError, match="the plant was made on cpu; make it on meta in place of moving it"):
+        env.to("meta")
 
 
 def test_measured_state_is_near_the_true_one(simulated: Simulated) -> None:

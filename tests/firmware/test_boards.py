@@ -34,25 +34,18 @@ def run_make(*words: object, folder: Path | None = None) -> "subprocess.Complete
 
 @needs_arm
 @pytest.mark.parametrize("board", ["nucleo_f401re", "qemu_an386"])
-def test_a_board_of_cortex_m_compiles_and_is_small(board: str, tmp_path: Path) -> None:
-    done = run_make(f"BUILD={tmp_path}", board)
-    assert (done.returncode, done.stderr) == (0, "")
+def test_a_board_of_cortex_m_is_small_and_reads_only_the_end_switches_of_its_rig(
+    board: str, tmp_path: Path
+) -> None:
+    header = rig_header(hardware_of({"right_switch": 1}), "a cart with a switch")
+    (tmp_path / "rig.h").write_text(header)
+    for words, symbols in (([f"RIG={tmp_path / 'rig.h'}"], 1), ([], 0)):
+        done = run_make(f"BUILD={tmp_path}", board, *words)
+        assert (done.returncode, done.stderr) == (0, "")
+        assert (tmp_path / f"{board}.elf").read_bytes().count(b"cart_hardware_switches") == symbols
     sizes = re.search(r"text\s+data\s+bss.*\n\s*(?P<text>\d+)\s+\d+\s+(?P<bss>\d+)", done.stdout)
     assert sizes is not None
     assert {name: int(sizes[name]) <= limit for name, limit in LARGEST.items()} == {"text": True, "bss": True}
-
-
-@needs_arm
-@pytest.mark.parametrize("board", ["nucleo_f401re", "qemu_an386"])
-def test_a_board_reads_end_switches_only_where_the_rig_has_them(board: str, tmp_path: Path) -> None:
-    header = rig_header(hardware_of({"right_switch": 1}), "a cart with a switch")
-    (tmp_path / "rig.h").write_text(header)
-    symbols = []
-    for words in ([f"RIG={tmp_path / 'rig.h'}"], []):
-        done = run_make(f"BUILD={tmp_path}", board, *words)
-        assert (done.returncode, done.stderr) == (0, "")
-        symbols.append((tmp_path / f"{board}.elf").read_bytes().count(b"cart_hardware_switches"))
-    assert symbols == [1, 0]
 
 
 @needs_arm

@@ -51,15 +51,19 @@ def test_both_firmwares_agree_under_sanitizers(rig: dict[str, float], seed: str,
     assert counted in done.stdout
 
 
-def test_another_rig_is_a_difference(monkeypatch: pytest.MonkeyPatch) -> None:
-    other = c_firmware.definitions(hardware_of({"moving_mass": 0.86}))
-    monkeypatch.setattr(c_firmware, "definitions", lambda hardware: other)
-    with pytest.raises(two_firmwares.DifferenceError, match="differ"):
-        two_firmwares.run(1000, 8000, seed=1)
+OTHER_RIG = c_firmware.definitions(hardware_of({"moving_mass": 0.86}))
+FEWER_WAIT = (
+    *(flag for flag in c_firmware.FLAGS if not flag.startswith("-DCART_PENDING")),
+    "-DCART_PENDING=1",
+)
 
 
-def test_another_number_of_waiting_commands_is_a_difference(monkeypatch: pytest.MonkeyPatch) -> None:
-    flags = [flag for flag in c_firmware.FLAGS if not flag.startswith("-DCART_PENDING")]
-    monkeypatch.setattr(c_firmware, "FLAGS", (*flags, "-DCART_PENDING=1"))
+@pytest.mark.parametrize(
+    ("name", "value"), [("definitions", lambda hardware: OTHER_RIG), ("FLAGS", FEWER_WAIT)]
+)
+def test_another_rig_or_number_of_waiting_commands_is_a_difference(
+    name: str, value: object, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(c_firmware, name, value)
     with pytest.raises(two_firmwares.DifferenceError, match="differ"):
         two_firmwares.run(1000, 8000, seed=1)

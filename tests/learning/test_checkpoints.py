@@ -1,6 +1,10 @@
-"""Checkpoints are written whole or not at all, and a file that is none is named in one clear line."""
+"""Checkpoints are written whole or not at all, and a file that is none is named in one clear line.
+
+Pretrained agents are small files in the package that load like any run.
+"""
 
 import errno
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -8,6 +12,7 @@ import pytest
 import torch
 from small_files import files_of_at_most
 
+import cartpole_rl
 from cartpole_rl.errors import CheckpointError
 from cartpole_rl.learning.checkpoints import (
     AGENT_FORMAT,
@@ -21,6 +26,7 @@ from cartpole_rl.learning.checkpoints import (
     save_agent,
     save_training,
 )
+from cartpole_rl.run_folder import find_agent
 
 AGENT = AgentCheckpoint(config={"seed": 1}, weights={"w": torch.arange(3.0)}, transitions=10, score=2.5)
 TRAINING = TrainingCheckpoint(config={"seed": 1}, state={"counters": [1, 2]}, step=10)
@@ -147,3 +153,27 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_earlier_one(count: int, 
     assert (caught.value.errno, caught.value.filename) == (errno.EFBIG, str(path))
     assert [each.name for each in path.parent.iterdir()] == ["resume.pt"]
     assert load_training(tmp_path) == TRAINING
+
+
+PRETRAINED = Path(cartpole_rl.__file__).parent / "pretrained"
+NAMES = sorted(path.name for path in PRETRAINED.iterdir())
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_pretrained_agent_is_small_and_says_how_it_was_made(name: str) -> None:
+    assert sum(path.stat().st_size for path in (PRETRAINED / name).iterdir()) < 300_000
+    agent = load_agent(Path("pretrained", name))
+    origin = json.loads((PRETRAINED / name / "provenance.json").read_text())
+    assert origin["command"][0] == "cartpole-train"
+    assert origin["score"] == agent.score
+    assert origin["seed"] == agent.config["seed"]
+
+
+def test_a_file_of_the_name_of_a_pretrained_agent_comes_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    mine = Path("pretrained/medium/checkpoints/last.pt")
+    mine.parent.mkdir(parents=True)
+    mine.touch()
+    assert find_agent(Path("pretrained/medium")) == mine

@@ -8,6 +8,7 @@ import torch
 from separate_device import DEVICE, SeparateTensor, separate_device
 from torch import Tensor
 from torch.utils._pytree import tree_leaves
+from toy_settings import TOY
 
 from cartpole_rl.envs.build import simulated_env, with_fitted_guard
 from cartpole_rl.errors import ConfigError
@@ -25,18 +26,15 @@ from cartpole_rl.workflows.train import (
     train,
 )
 
-SHORT = {
+SHORT = TOY[TrainConfig] | {
     "learning.transitions": 2048,
-    "learning.carts": 16,
     "learning.chunk": 5,
     "learning.updates": 2,
     "learning.batch_size": 32,
     "learning.warmup_transitions": 100,
-    "learning.evaluations": 1,
     "learning.retry_probability": 0.5,
     "buffer.size": 500,
     "task.time_limit": 6,
-    "compile": False,
 }
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from toy_settings import TOY
 
 from cartpole_rl.agents.settings import AGENTS
 from cartpole_rl.errors import ConfigError
@@ -120,20 +121,7 @@ class Lines:
     def close(self):
         self.file.close()
 '''
-TOY = {
-    "learning.transitions": 2048,
-    "learning.carts": 16,
-    "learning.chunk": 8,
-    "learning.updates": 1,
-    "learning.batch_size": 16,
-    "learning.warmup_transitions": 64,
-    "learning.evaluations": 3,
-    "learning.evaluation_episodes": 2,
-    "buffer.size": 2000,
-    "task.time_limit": 50,
-    "compile": False,
-    "logger": "own_agents:Lines",
-}
+SMALL = TOY[TrainConfig] | {"learning.evaluations": 3, "task.time_limit": 50, "logger": "own_agents:Lines"}
 
 
 @pytest.fixture(autouse=True)
@@ -149,7 +137,7 @@ def own_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("without_pictures")
 def test_it_is_trained_logged_and_driven(tmp_path: Path) -> None:
     run, kind = tmp_path / "run", "own_agents:Searched"
-    score = train(load_settings(TrainConfig, {**TOY, "agent.kind": kind}), run)
+    score = train(load_settings(TrainConfig, {**SMALL, "agent.kind": kind}), run)
     lines = (run / "lines.txt").read_text()
     assert " search/best " in lines
     assert " evaluation/score " in lines
@@ -165,7 +153,7 @@ def test_it_is_trained_logged_and_driven(tmp_path: Path) -> None:
 
 def test_fine_tuning_refuses_one_with_a_learner_of_its_own(tmp_path: Path) -> None:
     kind, run = "own_agents:SearchedNetwork", tmp_path / "agent.pt"
-    training = load_settings(TrainConfig, {**TOY, "agent.kind": kind})
+    training = load_settings(TrainConfig, {**SMALL, "agent.kind": kind})
     save_agent(
         run, AgentCheckpoint(training.model_dump(mode="json"), new_agent(training).state_dict(), 0, None)
     )
@@ -184,7 +172,7 @@ def test_fine_tuning_refuses_one_with_a_learner_of_its_own(tmp_path: Path) -> No
 )
 def test_what_cannot_be_one_is_refused(setting: dict[str, str], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        load_settings(TrainConfig, TOY | setting)
+        load_settings(TrainConfig, SMALL | setting)
 
 
 @pytest.mark.parametrize(
@@ -200,14 +188,14 @@ def test_what_cannot_be_one_is_refused(setting: dict[str, str], message: str) ->
     ],
 )
 def test_a_network_that_cannot_drive_is_refused(network: str, complaint: str) -> None:
-    training = load_settings(TrainConfig, {**TOY, "agent.network": f"own_agents:{network}"})
+    training = load_settings(TrainConfig, {**SMALL, "agent.network": f"own_agents:{network}"})
     with pytest.raises(ConfigError, match=rf"^agent\.network=own_agents:{network}: it {complaint}"):
         new_agent(training)
 
 
 @pytest.mark.parametrize("network", ["steady", "Stateful"])
 def test_to_try_a_network_changes_nothing(network: str) -> None:
-    training = load_settings(TrainConfig, {**TOY, "agent.network": f"own_agents:{network}"})
+    training = load_settings(TrainConfig, {**SMALL, "agent.network": f"own_agents:{network}"})
     torch.manual_seed(0)
     tried = new_agent(training).actor.module[0].module
     after, state = torch.get_rng_state(), getattr(tried, "state", None)

@@ -9,7 +9,8 @@ import pytest
 from cartpole_rl.emulator.c_firmware import COMPILERS, CFirmware
 from cartpole_rl.emulator.firmware import Firmware
 from cartpole_rl.emulator.settings import EmulatorSettings
-from cartpole_rl.wire.messages import Message, SetMotor
+from cartpole_rl.wire.frames import Frame, decode_frame, encode_frame
+from cartpole_rl.wire.messages import Flags, Message, Nack, Reason, SetMotor, State
 
 KINDS: dict[str, type[Firmware] | type[CFirmware]] = {"python": Firmware, "c": CFirmware}
 one_firmware = pytest.mark.parametrize("each_firmware", ["python"], indirect=True)  # of `each_firmware`
@@ -46,3 +47,39 @@ def motors_over(firmware: Firmware | CFirmware, start_us: int, end_us: int) -> l
         firmware.drive(due_us)
         values.append((max(due_us, start_us), firmware.motor))
     return values
+
+
+class Bench:
+    """A firmware whose encoder counts a test sets."""
+
+    def __init__(self, latency_us: int = 0, homed: bool = True) -> None:
+        self.firmware = make_firmware(lambda: latency_us, homed)
+        self.now_us = 0
+        self.sequence = self.ticks = 0
+
+    def send(self, message: Message) -> Message | None:
+        """Send a message; return the answer or None."""
+        frame = encode_frame(answering(self.ticks, message), self.sequence)[:-1]
+        self.sequence = (self.sequence + 1) & 0xFF
+        answers = [decode_frame(answer[:-1]).message for answer in self.firmware.receive(frame, self.now_us)]
+        assert len(answers) <= 1
+        return answers[0] if answers else None
+
+    def refusal(self, message: Message) -> Reason | None:
+        """Send a message; return the reason of its refusal or None."""
+        answer = self.send(message)
+        return Reason(answer.reason) if isinstance(answer, Nack) else None
+
+    def frames(self, cart: int = 0, pole: int = 0) -> list[Frame]:
+        """Pass a period; return the frames at its end."""
+        end = self.now_us + self.firmware.period_us
+        self.motors = motors_over(self.firmware, self.now_us, end)
+        self.now_us = end
+        self.ticks += 1
+        return [decode_frame(frame[:-1]) for frame in self.firmware.tick(end, cart, pole)]
+
+    def tick(self, cart: int = 0, pole: int = 0) -> tuple[State, Flags]:
+        """Pass a period; return its STATE and flags."""
+        last = self.frames(cart, pole)[-1]
+        assert isinstance(last.message, State)
+        return last.message, Flags(last.flags)

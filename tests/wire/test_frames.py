@@ -1,6 +1,6 @@
 """Frames, messages and byte stuffing: round trips, detection of damage, published vectors.
 
-A splitter stays synchronized and bounded.
+A splitter stays synchronized and bounded; the cart's ticks and clock wrap at 2^32.
 """
 
 from dataclasses import fields
@@ -21,7 +21,18 @@ from cartpole_rl.wire.frames import (
     stuff,
     unstuff,
 )
-from cartpole_rl.wire.messages import MESSAGES, Hello, Message, MessageType, SetMotor, State
+from cartpole_rl.wire.messages import (
+    MESSAGES,
+    Hello,
+    Message,
+    MessageType,
+    SetMotor,
+    State,
+    microseconds_between,
+    seconds_between,
+    ticks_between,
+    went_back,
+)
 
 LIMITS = {"B": (0, 255), "h": (-(2**15), 2**15 - 1), "H": (0, 2**16 - 1)}
 LIMITS |= {"i": (-(2**31), 2**31 - 1), "I": (0, 2**32 - 1)}
@@ -167,3 +178,20 @@ def test_bytes_that_no_encoder_makes_are_refused(stuffed):
 def test_checksum_of_the_catalogue():
     assert crc16(b"123456789") == 0x29B1
     assert crc16(b"") == 0xFFFF
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "difference"), [(5, 7, 2), (2**32 - 1, 1, 2), (7, 7, 0), (7, 5, 2**32 - 2)]
+)
+def test_differences_are_right_across_the_wrap(before: int, after: int, difference: int) -> None:
+    assert ticks_between(before, after) == difference
+    assert microseconds_between(before, after) == difference
+    assert seconds_between(before, after) == pytest.approx(difference * 1e-6)
+
+
+def test_an_older_number_is_recognized() -> None:
+    assert went_back(ticks_between(7, 5))
+    assert went_back(ticks_between(3, 2**32 - 3))
+    assert not went_back(ticks_between(5, 7))
+    assert not went_back(ticks_between(2**32 - 3, 3))
+    assert not went_back(ticks_between(7, 7))

@@ -48,7 +48,7 @@ def test_each_rule_says_when_it_holds(rule):
 
 
 def test_the_limits_before_the_first_homing_are_stated():
-    """The same numbers as in tests/emulator/test_emulator_device.py."""
+    """The same numbers as in tests/emulator/test_device.py."""
     text = " ".join(PAGE.split("**The limits in INFO**")[1].split("\n\n")[0].split())
     assert "Before the first homing" in text
     assert "16704 and 17539" in text
