@@ -3,6 +3,7 @@
 import ctypes
 import shutil
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -258,25 +259,32 @@ def test_the_c_code_of_a_policy_gives_0_at_another_period():
     assert motors[0] == 0 != motors[1]
 
 
-@pytest.mark.parametrize("name", ["POLICY_CART_NANOMETRES_PER_COUNT", "POLICY_POLE_COUNTS_PER_TURN"])
-def test_a_policy_for_other_encoders_does_not_compile(name, tmp_path):
-    with pytest.raises(EmulatorError, match="for other encoders"):
-        build_library(changed(tmp_path, f"{name} ", f"{name} 1"))
+LENGTH = ("POLICY_OBSERVES_LENGTH 0", "POLICY_OBSERVES_LENGTH 1")
 
 
-@pytest.mark.parametrize("flags", [[], ["-DCART_POLE_LENGTH=0.3556f"]])
-def test_an_agent_that_observes_the_length_compiles_only_with_one(flags, tmp_path):
-    changed(tmp_path, "POLICY_OBSERVES_LENGTH 0", "POLICY_OBSERVES_LENGTH 1")
+@pytest.mark.parametrize(
+    ("change", "flag", "error"),
+    [
+        (
+            ("POLICY_CART_NANOMETRES_PER_COUNT ", "POLICY_CART_NANOMETRES_PER_COUNT 1"),
+            "",
+            "for other encoders",
+        ),
+        (("POLICY_POLE_COUNTS_PER_TURN ", "POLICY_POLE_COUNTS_PER_TURN 1"), "", "for other encoders"),
+        (LENGTH, "", "compile with -DCART_POLE_LENGTH="),
+        (LENGTH, "-DCART_POLE_LENGTH=0.3556f", ""),
+    ],
+)
+def test_a_policy_compiles_only_for_the_encoders_and_with_the_length_that_it_needs(
+    change, flag, error, tmp_path
+):
+    changed(tmp_path, *change)
     board = tmp_path / "board.c"
     board.write_text(
         '#include "onboard.h"\nvoid boot(cart *self);\nvoid boot(cart *self) { onboard_attach(self); }\n'
     )
-    words = ("-fsyntax-only", f"-I{tmp_path}", *flags)
-    if flags:
-        compile_c(tmp_path / "none", [board], *words)
-    else:
-        with pytest.raises(EmulatorError, match="compile with -DCART_POLE_LENGTH="):
-            compile_c(tmp_path / "none", [board], *words)
+    with pytest.raises(EmulatorError, match=error) if error else nullcontext():
+        compile_c(tmp_path / "none", [board], "-fsyntax-only", f"-I{tmp_path}", *filter(None, [flag]))
 
 
 def test_the_c_code_of_a_policy_observes_the_length_of_the_emulated_pole(tmp_path):

@@ -130,7 +130,7 @@ def test_the_coarsest_encoders_are_fine_enough(period_us: int, seed: int) -> Non
     rig = hardware_of({"cart_nanometres_per_count": 600_000, "pole_counts_per_turn": 200})
     light = {"pole_viscous": 3e-4, "pole_coulomb": 1e-4}  # a bearing that leaves the braking to the cart
     cart = EmulatorSettings(**COARSE, **light, seed=seed, boot="anywhere").of_cart(rig.model_dump())
-    driven = Driven(**cart.model_dump())
+    driven = Driven(**cart.model_dump() | {"firmware": "c"})
     driven.ask(SetPeriod(period_us))
     state = driven.home()
     assert (driven.flags, state.fault) == (Flags.HOMED, Fault.NONE)

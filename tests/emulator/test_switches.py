@@ -46,11 +46,14 @@ def home_from(place: float, switches: int, firmware: str, period_us: int) -> tup
 
 @needs_compiler
 @pytest.mark.parametrize(
-    ("place", "period_us"),
-    [(0.03, 20_000), (-HALF - 0.0035, 20_000), (HALF + 0.0035, 5_000), (0.03, 100_000)],
-    ids=["inside", "on the left one", "on the right one", "long periods"],
+    ("switches", "place", "period_us"),
+    [
+        *((switches, 0.03, 20_000) for switches in (BOTH, LEFT, RIGHT)),
+        *((switches, -HALF - 0.0035, 20_000) for switches in (BOTH, LEFT, RIGHT)),
+        *((switches, HALF + 0.0035, 5_000) for switches in (BOTH, RIGHT)),  # on the right one
+        (BOTH, 0.03, 100_000),
+    ],
 )
-@pytest.mark.parametrize("switches", [BOTH, LEFT, RIGHT], ids=["both", "left", "right"])
 def test_both_firmwares_find_the_same_ends(switches: int, place: float, period_us: int) -> None:
     driven, state, farthest = home_from(place, switches, "python", period_us)
     c, same, _ = home_from(place, switches, "c", period_us)

@@ -126,7 +126,7 @@ def test_a_recorded_cart(simulated: Simulated, make_environment: Callable[..., C
 
 def test_an_emulated_cart(make_environment: Callable[..., CartPoleEnv]) -> None:
     """Two lockstep carts with the same seed, to the end of the track."""
-    plants = [emulated_plant(EmulatorSettings(seed=1)) for _ in range(2)]
+    plants = [emulated_plant(EmulatorSettings(seed=1, physics_step=1e-3)) for _ in range(2)]
     try:
         pair = [make_environment(plant, time_limit=100) for plant in plants]
         assert 5 < compare(*pair, [0, 2, 1, 0, 2] * 5 + [2] * 75) < 100
