@@ -137,11 +137,7 @@ def test_homing_after_a_lost_zero_neither_pumps_the_pole_nor_strikes_the_stops()
 
 
 @pytest.mark.parametrize(
-    (
-        "dies",
-        "pushed",
-        "fastest",
-    ),  # s after HOME, s, m/s: on the way to the left, to the right, to the middle
+    ("dies", "pushed", "fastest"),  # s after HOME, s, m/s: on the way to the left, the right, the middle
     [(3.0, 1.0, 0.95), (9.0, 0.05, 0.3), (12.5, 0.05, 0.3)],
 )
 def test_a_cart_encoder_that_dies_in_homing_ends_it(dies, pushed, fastest):

@@ -68,12 +68,7 @@ def dying(driven: Driven) -> Host:
 
 @pytest.mark.parametrize(
     ("cart", "period_us"),
-    [
-        (LARGE, 20_000),
-        (HEAVY, 100_000),
-        (SLIPPERY, 5_000),
-        (SLIPPERY, 100_000),
-    ],
+    [(LARGE, 20_000), (HEAVY, 100_000), (SLIPPERY, 5_000), (SLIPPERY, 100_000)],
     ids=["large", "heavy slow", "slippery fast", "slippery slow"],
 )
 @pytest.mark.parametrize("host", [outward, to_and_fro, pumping, dying])

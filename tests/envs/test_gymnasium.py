@@ -218,10 +218,7 @@ def test_many_carts_are_reset_first_and_take_one_seed() -> None:
 
 
 def test_only_existing_actions_are_taken() -> None:
-    one, many = (
-        gymnasium.make("cartpole_rl/SwingUp-v0"),
-        gymnasium.make_vec("cartpole_rl/SwingUp-v0", num_envs=2, vectorization_mode="vector_entry_point"),
-    )
+    one, many = gymnasium.make("cartpole_rl/SwingUp-v0"), vector("cartpole_rl/SwingUp-v0", carts=2)
     for env in (one, many):
         env.reset(seed=0)
     for action in (-1, 9, 2.0, True, [2]):

@@ -21,10 +21,7 @@ from cartpole_rl.tasks.settings import NO_ACTION
 
 Simulated = Callable[..., CartPoleEnv]
 GUARD = TrackGuard(margin=0.05, delay=0.1, deceleration=3.0)
-NOISY = {
-    "latency_jitter": Range(absolute=(0.001, 0.01)),
-    "angle_noise": Range(absolute=(1e-4, 1e-3)),
-}
+NOISY = {"latency_jitter": Range(absolute=(0.001, 0.01)), "angle_noise": Range(absolute=(1e-4, 1e-3))}
 OBSERVATIONS: tuple[dict[str, Any], ...] = (
     {"pole_length": True},
     {"kind": "raw", "past_motors": 0, "past_velocities": 0},

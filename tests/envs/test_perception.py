@@ -91,13 +91,8 @@ def test_scores_measure_the_speed_of_the_pole_over_20_ms_at_least() -> None:
     assert after_rest.score[0].tolist() == pytest.approx([11, 11], abs=1e-5)
     assert float(after_rest.speeds[0, 1]) == float(after_rest.state[3, 1]) == pytest.approx(math.tau / 40.96)
     assert perceived(moved, task, speeds=(0.15,)).score[0].tolist() == pytest.approx([11, 6], abs=1e-5)
-    assert [speed_periods(each, nominal_encoders()) for each in (0.005, 0.01, 0.019, 0.02, 0.05)] == [
-        4,
-        2,
-        2,
-        1,
-        1,
-    ]
+    fine = nominal_encoders()
+    assert [speed_periods(each, fine) for each in (0.005, 0.01, 0.019, 0.02, 0.05)] == [4, 2, 2, 1, 1]
     coarse = nominal_encoders()._replace(turn=2400)  # a count is 0.15 degrees, 25 ms at 6 degrees/s
     assert [speed_periods(each, coarse) for each in (0.01, 0.02, 0.025, 0.05)] == [3, 2, 2, 1]
 

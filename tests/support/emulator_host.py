@@ -89,12 +89,8 @@ class EmulatorHost:
 @contextlib.contextmanager
 def emulator(**settings: object) -> Iterator[EmulatorHost]:
     """Run an emulator; terminate it at the end and check that its exit status is 0."""
-    command = [
-        sys.executable,
-        "-m",
-        "cartpole_rl.emulator",
-        json.dumps({"firmware": UnderTest.kind} | settings),
-    ]
+    given = json.dumps({"firmware": UnderTest.kind} | settings)
+    command = [sys.executable, "-m", "cartpole_rl.emulator", given]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
         host = EmulatorHost(process)

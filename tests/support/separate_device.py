@@ -17,13 +17,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map_only
 
 DEVICE, CPU = torch.device("meta"), torch.device("cpu")
-CAN_MIX = (
-    "_to_copy",
-    "copy_",
-    "index",
-    "index_put_",
-    "_index_put_impl_",
-)  # CUDA takes operands on the CPU here
+# CUDA takes operands on the CPU here
+CAN_MIX = ("_to_copy", "copy_", "index", "index_put_", "_index_put_impl_")
 
 
 class SeparateTensor(Tensor):
