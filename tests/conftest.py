@@ -16,6 +16,8 @@ Hydra reads each file of conf/ once: reading them would take a third of the time
 
 import gc
 import os
+import pickle
+import shutil
 import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -27,6 +29,7 @@ import pytest
 import torch
 import yaml
 from command_line import no_pictures
+from filelock import FileLock
 from hypothesis import HealthCheck, settings
 
 from cartpole_rl.envs.build import make_env
@@ -102,6 +105,26 @@ def make_cart(ip02: dict[str, float], medium: PoleSettings) -> Callable[..., Car
         return CartParameters(torch.stack(rows))
 
     return build
+
+
+@pytest.fixture(scope="session")
+def once(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., tuple[Path, Any]]:
+    """Let one worker fill a folder; every worker gets a copy of its own, and what `make` returned."""
+    own = tmp_path_factory.getbasetemp()
+    shared = (own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / "shared"
+    shared.mkdir(exist_ok=True)
+
+    def once(name: str, make: Callable[[Path], Any]) -> tuple[Path, Any]:
+        folder, ended = shared / name, shared / f"{name}.pickle"
+        with FileLock(shared / f"{name}.lock"):
+            if not ended.exists():
+                shutil.rmtree(folder, ignore_errors=True)
+                folder.mkdir()
+                ended.write_bytes(pickle.dumps(make(folder)))
+        copy = shutil.copytree(folder, tmp_path_factory.mktemp(name), dirs_exist_ok=True)
+        return copy / "run", pickle.loads(ended.read_bytes())
+
+    return once
 
 
 @pytest.fixture

@@ -1,13 +1,8 @@
-"""Runs that several test files share: two trainings (one interrupted), an identification, a fine-tuning.
+"""Runs that several test files share: two trainings (one interrupted), an identification, a fine-tuning."""
 
-One worker of the tests makes each; every worker has a copy of its own.
-"""
-
-import os
-import pickle
-import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from command_line import (
@@ -20,33 +15,12 @@ from command_line import (
     no_pictures,
     prints_only_progress,
 )
-from filelock import FileLock
 
-Make = Callable[[str, Callable[[Path], Outcome]], tuple[Path, Outcome]]
-
-
-@pytest.fixture(scope="session")
-def once(tmp_path_factory: pytest.TempPathFactory) -> Make:
-    """Return a function that lets one worker fill a folder, and returns a copy and the outcome."""
-    own = tmp_path_factory.getbasetemp()
-    shared = (own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / "shared"
-    shared.mkdir(exist_ok=True)
-
-    def once(name: str, make: Callable[[Path], Outcome]) -> tuple[Path, Outcome]:
-        folder, ended = shared / name, shared / f"{name}.pickle"
-        with FileLock(shared / f"{name}.lock"):
-            if not ended.exists():
-                shutil.rmtree(folder, ignore_errors=True)
-                folder.mkdir()
-                ended.write_bytes(pickle.dumps(make(folder)))
-        copy = shutil.copytree(folder, tmp_path_factory.mktemp(name), dirs_exist_ok=True)
-        return copy / "run", pickle.loads(ended.read_bytes())
-
-    return once
+Once = Callable[..., tuple[Path, Any]]
 
 
 @pytest.fixture(scope="session")
-def trained(once: Make) -> Path:
+def trained(once: Once) -> Path:
     """The run folder of a tiny training; with two actions its agent always moves the cart."""
 
     def make(folder: Path) -> Outcome:
@@ -59,7 +33,7 @@ def trained(once: Make) -> Path:
 
 
 @pytest.fixture(scope="session")
-def interrupted(once: Make) -> tuple[Path, Outcome]:
+def interrupted(once: Once) -> tuple[Path, Outcome]:
     """The folder and the outcome of a tiny training that was interrupted after its first checkpoint."""
     longer = ("actions=two", "learning.transitions=2000000", "learning.evaluations=2000", "hydra.run.dir=run")
 
@@ -80,7 +54,7 @@ def stopped(interrupted: tuple[Path, Outcome]) -> Path:
 
 
 @pytest.fixture(scope="session")
-def identified(once: Make) -> tuple[Path, Outcome]:
+def identified(once: Once) -> tuple[Path, Outcome]:
     """The run folder and the outcome of an identification of an emulated cart."""
 
     def make(folder: Path) -> Outcome:
@@ -92,7 +66,7 @@ def identified(once: Make) -> tuple[Path, Outcome]:
 
 
 @pytest.fixture(scope="session")
-def tuned(once: Make, trained: Path) -> tuple[Path, Outcome]:
+def tuned(once: Once, trained: Path) -> tuple[Path, Outcome]:
     """The run folder and the outcome of a short fine-tuning on an emulated cart."""
 
     def make(folder: Path) -> Outcome:

@@ -3,7 +3,9 @@
 import json
 import math
 import shutil
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from command_line import Outcome, in_process, no_pictures
@@ -58,14 +60,20 @@ def runs(
     stopped: Path,
     identified: tuple[Path, Outcome],
     tuned: tuple[Path, Outcome],
-    tmp_path_factory: pytest.TempPathFactory,
+    once: Callable[..., tuple[Path, Any]],
 ) -> Path:
     """A folder with a toy run of each command, named after it, and an interrupted training."""
-    folder = tmp_path_factory.mktemp("runs")
+    return once("runs", lambda folder: make_runs(folder / "run", trained, stopped, identified[0], tuned[0]))[
+        0
+    ]
+
+
+def make_runs(folder: Path, trained: Path, stopped: Path, identified: Path, tuned: Path) -> None:
+    """Fill a folder with them."""
     shutil.copytree(trained, folder / "train")
     shutil.copytree(stopped, folder / "unfinished")
-    shutil.copytree(identified[0], folder / "identify")
-    shutil.copytree(tuned[0], folder / "finetune")
+    shutil.copytree(identified, folder / "identify")
+    shutil.copytree(tuned, folder / "finetune")
     model = ("windows=20", "ensemble.members=1", "ensemble.hidden=4", "ensemble.updates=2")
     small = [f"distillation.{name}=2" for name in ("carts", "rounds", "periods", "updates", "batch_size")]
     rows = "".join(f"{row / 50},{math.sin(row / 9) / 9},{row / 9},{row % 2}\n" for row in range(100))
@@ -85,7 +93,6 @@ def runs(
         for command, *words in made:
             done = in_process(command, *words, folder=folder)
             assert done.code == 0, done.err
-    return folder
 
 
 def contents(folder: Path) -> dict[str, tuple[int, int]]:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from contextlib import closing
 from functools import partial
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -44,6 +45,7 @@ from cartpole_rl.rig.hardware import Hardware, hardware_of, nominal_encoders, no
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.tasks.settings import Start, StartSettings
 
+Once = Callable[..., tuple[Path, Any]]
 PERIOD = 0.02
 MODELS = Models.of(cart_friction="step", pole_friction="bearing")
 TRUTH = {
@@ -81,15 +83,21 @@ class SimulatedCart(OneCartPlant):
 
 
 @pytest.fixture(scope="module")
-def recordings(make_plant: Callable[..., SimulatedPlant]) -> dict[str, Episode]:
-    plant = make_plant(1, cart=TRUTH, models=MODELS, start=HANGING)
-    shorter = tuple(each._replace(moves=SHORTER.get(each.name, each.moves)) for each in EXPERIMENTS)
-    return {each.name: episode for each, episode in conduct(plant, PERIOD, experiments=shorter)}
+def recordings(make_plant: Callable[..., SimulatedPlant], once: Once) -> dict[str, Episode]:
+    def make(_: Path) -> dict[str, Episode]:
+        plant = make_plant(1, cart=TRUTH, models=MODELS, start=HANGING)
+        shorter = tuple(each._replace(moves=SHORTER.get(each.name, each.moves)) for each in EXPERIMENTS)
+        return {each.name: episode for each, episode in conduct(plant, PERIOD, experiments=shorter)}
+
+    return once("experiments", make)[1]
 
 
 @pytest.fixture(scope="module")
-def found(recordings: dict[str, Episode], nominal: dict[str, float]) -> Identification:
-    return identify(*split(recordings), nominal, MODELS, PERIOD, substeps=4, most=40)
+def found(recordings: dict[str, Episode], nominal: dict[str, float], once: Once) -> Identification:
+    def make(_: Path) -> Identification:
+        return identify(*split(recordings), nominal, MODELS, PERIOD, substeps=4, most=40)
+
+    return once("found", make)[1]
 
 
 def split(recordings: dict[str, Episode]) -> tuple[dict[str, Episode], dict[str, Episode]]:
