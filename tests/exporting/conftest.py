@@ -10,7 +10,7 @@ from cartpole_rl.envs.build import simulated_env
 from cartpole_rl.exporting.agent import ExportedAgent, Floats
 from cartpole_rl.workflows.build import TrainedAgent, exported_agent, new_agent, provenance, trained_agent
 from cartpole_rl.workflows.config import TrainConfig, load_settings
-from cartpole_rl.workflows.export import page as page_of
+from cartpole_rl.workflows.export import files_of
 
 MEDIUM = Path("pretrained/medium")
 
@@ -27,7 +27,7 @@ def exported(medium_agent: TrainedAgent) -> ExportedAgent:
 
 @pytest.fixture(scope="session")
 def page(exported: ExportedAgent, medium_agent: TrainedAgent) -> str:
-    return page_of(exported, medium_agent)
+    return files_of("web", exported, medium_agent)["cart.html"].decode()
 
 
 @pytest.fixture(scope="session")
@@ -39,7 +39,7 @@ def balancing() -> TrainedAgent:
 
 @pytest.fixture(scope="session")
 def balancing_page(balancing: TrainedAgent) -> str:
-    return page_of(exported_agent(balancing, {}), balancing)
+    return files_of("web", exported_agent(balancing, {}), balancing)["cart.html"].decode()
 
 
 @pytest.fixture(scope="session")

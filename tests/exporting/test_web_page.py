@@ -23,7 +23,7 @@ from cartpole_rl.rig.hardware import nominal_encoders
 from cartpole_rl.scalar import Scalar
 from cartpole_rl.workflows.build import TrainedAgent, exported_agent, network_of, new_agent
 from cartpole_rl.workflows.config import TrainConfig, load_settings
-from cartpole_rl.workflows.export import page as page_of
+from cartpole_rl.workflows.export import files_of
 
 PERIODS = 100  # 2 s
 HANGING = {"x": 0.05, "x_dot": 0.0, "theta": math.pi, "theta_dot": 0.0}
@@ -146,7 +146,8 @@ def test_a_long_nominal_latency_is_simulated_as_it_is(tmp_path: Path) -> None:
     const shown = element("latency-value").textContent;
     document.body.textContent = JSON.stringify([simulated.parameters.latency, shown, DATA.commands]);
     """
-    found = in_browser(page_of(exported_agent(slow, {}), slow), script, tmp_path)
+    page = files_of("web", exported_agent(slow, {}), slow)["cart.html"].decode()
+    found = in_browser(page, script, tmp_path)
     assert found == [0.0625, "62.5 ms", commands_under_way(0.0625, 0.02)]
 
 
