@@ -100,7 +100,7 @@ class TestMotor:
             with SerialCart(quick_settings(peer.port)) as cart:
                 assert cart.set_motor(255) == 180
 
-    @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
+    @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, SystemExit])
     def test_every_way_out_stops_the_motor(self, error: type[BaseException]) -> None:
         with CartPeer() as peer:
             with pytest.raises(error), SerialCart(quick_settings(peer.port)) as cart:

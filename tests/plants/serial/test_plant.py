@@ -318,7 +318,7 @@ def test_a_person_who_agrees_lets_a_fault_be_cleared(peer: CartPeer) -> None:
 
 
 def test_unattended_work_gives_up_after_the_stated_number_of_faults(peer: CartPeer) -> None:
-    """A fault whose cause persists counts as one."""
+    """An attempt at which the cause persists counts, too."""
     with closing(SerialPlant(quick_settings(peer.port, clear_faults=2))) as plant:
         plant.reset()
         with pytest.raises(FaultError, match="motor"):

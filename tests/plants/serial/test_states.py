@@ -136,8 +136,8 @@ def test_a_clock_that_may_have_wrapped_unseen_is_believed() -> None:
             before = cart.get_state()
             ticks = minutes * 60 * 50
             time_us = (before.time_us + ticks * 20_000) % 2**32
-            peer.tick(tick=before.tick + ticks, time_us=time_us, cart_counts=7)
-            assert cart.get_state().cart_counts == 7
+            peer.tick(tick=before.tick + ticks, time_us=time_us, cart_counts=minutes)
+            assert cart.get_state().cart_counts == minutes
 
 
 def test_a_command_that_comes_too_late_is_0(host_clock: SimpleNamespace) -> None:
@@ -170,9 +170,11 @@ def test_time_that_passes_for_the_host_alone_makes_no_command_late(host_clock: S
         assert cart.set_motor(200) == 200
 
 
-@pytest.mark.parametrize(("on_board", "newer"), [(False, False), (True, False), (True, True)])
+@pytest.mark.parametrize(
+    ("on_board", "newer", "seconds"), [(False, False, 600.0), (True, False, 600.0), (True, True, 3.0)]
+)
 def test_a_computer_that_slept_answers_no_state_from_before(
-    host_clock: SimpleNamespace, on_board: bool, newer: bool
+    host_clock: SimpleNamespace, on_board: bool, newer: bool, seconds: float
 ) -> None:
     """Nor lets a policy on the board drive on. A newer state may wait already, or the port wakes later."""
     with CartPeer(paced=True) as peer, SerialCart(quick_settings(peer.port, timeout=10.0)) as cart:
@@ -183,8 +185,8 @@ def test_a_computer_that_slept_answers_no_state_from_before(
             peer.tick()
             wait_for(lambda: peer.unread() > 0)
         greeted = len(peer.messages(Hello))
-        host_clock.ahead += 600.0
-        with pytest.raises(LinkError, match=r"did not answer the cart on .* for 600\.\d s"):
+        host_clock.ahead += seconds
+        with pytest.raises(LinkError, match=rf"did not answer the cart on .* for {seconds:.0f}\.\d s"):
             cart.follow_policy() if on_board else cart.set_motor(200)
     assert len(peer.messages(Hello)) == greeted
     assert not any(message.motor for message in peer.messages(SetMotor))
