@@ -173,7 +173,7 @@ def test_numbers_come_back_to_the_bit() -> None:
         ("repeat.run=emulated repeat.episode=0", "plant=emulated", "give a run with plant=simulated"),
         ("repeat.run=older repeat.episode=0", "repeat.run=older", "evaluate again"),
         ("repeat.run=damaged repeat.episode=0", "repeat.run=damaged", "give the run folder of one"),
-        ("repeat.run=wide repeat.episode=1 seed=3", "leave out seed=3", "own settings"),
+        ("repeat.run=wide repeat.episode=1 seed=3 plant=emulated", "seed=3, plant=emulated", "own settings"),
     ],
 )
 def test_bad_input_is_told_in_a_line(

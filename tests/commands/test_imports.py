@@ -77,6 +77,7 @@ COMPLAINS = {  # command: words, exit code, part of the line on stderr
         ("agent.hidden=[7]", 2, "even numbers of units"),
         ("cart.cart_mass=-1", 2, "cart_mass is -1"),
         ("randomization.cart_mass.relative=[-1.5,0]", 2, "it must be above 0"),
+        ("pole=tiny", 2, "both, laboratorio, large, medium, range"),
     ],
 }
 WORK = {  # what only work needs

@@ -193,7 +193,7 @@ def test_a_file_extends_a_file_beside_it(tmp_path: Path) -> None:
         assert config.seed == settings["seed"]
 
 
-@pytest.mark.parametrize("text", ["no", "1:30"])
+@pytest.mark.parametrize("text", ["no", "yes", "1:30", "on"])
 def test_a_number_is_a_number(text: str, tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text(f"defaults: [ip02]\ncart_viscous: {text}\n")
     if text == "no":
