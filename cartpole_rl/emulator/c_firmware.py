@@ -76,7 +76,9 @@ class CFirmware:
     armed: bool = of_head("armed")  # the cart obeys SET_MOTOR
     homed: bool = of_head("homed")  # the zeros are set
     homing: bool = of_head("homing")
-    switches: int = of_head("switches")  # end switches that are pressed, as bits; set it before each `look`
+    switches: int = of_head(
+        "switches"
+    )  # end switches that are pressed: 1 left, 2 right; set it before each `look`
 
     def __init__(
         self,
