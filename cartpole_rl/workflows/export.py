@@ -102,13 +102,7 @@ def files_of(form: str, agent: ExportedAgent, trained: TrainedAgent) -> dict[str
             return {"agent.onnx": onnx_model(agent, network_of(trained))}
         case "c":
             return {name: text.encode() for name, text in c_files(agent, trained.training).items()}
-        case _:
-            return {"cart.html": page(agent, trained).encode()}
-
-
-def page(agent: ExportedAgent, trained: TrainedAgent) -> str:
-    """Return cart.html. Raises ConfigError for an agent that was not trained in simulation."""
     plant = trained.training.plant
     if plant.has_residual:
         raise ConfigError(f"format=web: the agent was trained with plant={plant.kind}, not plant=simulated")
-    return web_page(agent, trained.training, plant)
+    return {"cart.html": web_page(agent, trained.training, plant).encode()}
