@@ -3,6 +3,7 @@
 A fit returns a cart for any data. These checks refuse data that no cart could have produced.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 
@@ -178,19 +179,23 @@ def shows_motion(episode: Episode) -> bool:
 def check_explained(recordings: Mapping[str, Episode], dynamics: Dynamics, horizon: float) -> list[Replayed]:
     """Return each recording beside its replay by the fitted cart; see `replay` for `horizon`, s.
 
-    Raises RecordingError for the first one, by the name of its file, whose motion the cart does not explain.
+    Raises RecordingError for the one that the cart explains least, by the name of its file, if that is too
+    little. A single wrong recording spoils the fit to all of them, so the first that fails need not be it.
     """
     replays = replay(recordings, dynamics, horizon)
-    for file, replayed in zip(recordings, replays, strict=True):
+    errors = [(*_unexplained(each, horizon), file) for file, each in zip(recordings, replays, strict=True)]
+    share, message, file = max(errors, default=(0.0, "", ""))
+    if share > UNEXPLAINED:
         with naming(file):
-            _check_explained(replayed, horizon)
+            raise RecordingError(message)
     return replays
 
 
-def _check_explained(replayed: Replayed, horizon: float) -> None:
-    kept = away_from_upright(replayed)
+def _unexplained(replayed: Replayed, horizon: float) -> tuple[float, str]:
+    """Return the larger error of cart and pole as a share of its motion, and a message; 0 if it is small."""
+    kept, found = away_from_upright(replayed), (0.0, "")
     if not kept.any():
-        return
+        return found
     for name, values, errors, small, (unit, factor) in zip(
         ("cart", "pole"),
         (replayed.x, replayed.theta),
@@ -203,12 +208,15 @@ def _check_explained(replayed: Replayed, horizon: float) -> None:
         error, motion = (
             factor * np.sqrt(np.mean(each[kept] ** 2)) for each in (errors, measured - measured[:, :1])
         )
-        if error > factor * small and error > UNEXPLAINED * motion:
-            raise RecordingError(
+        share = float(error / motion) if motion else math.inf
+        if error > factor * small and share > found[0]:
+            found = (
+                share,
                 f"no cart explains this recording: {horizon:g} s of the {name}'s motion, {motion:.0f} "
                 f"{unit.rpartition('_')[2]}, is predicted {error:.0f} wrong; check its motor values "
-                "and counts, and that all recordings are of one cart, or leave it out"
+                "and counts, and that all recordings are of one cart, or leave it out",
             )
+    return found
 
 
 def _check_motion(episodes: Sequence[Episode], travel: float, swing: float) -> None:

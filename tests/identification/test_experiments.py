@@ -488,6 +488,17 @@ def test_a_recording_that_no_such_cart_moves_like_is_refused(
         judged(found.fit, found.dynamics, found.candidates, fitted, held_out | others)
 
 
+def test_the_recording_of_which_the_cart_explains_least_is_named(
+    recordings: dict[str, Episode], found: Identification
+) -> None:
+    late, later = (changed(recordings[HELD_OUT], motor=partial(np.roll, shift=shift)) for shift in (10, 40))
+    for order in ({"late": late, "later": later}, {"later": later, "late": late}):
+        with pytest.raises(RecordingError, match=r"^later: no cart explains this recording"):
+            check_explained(order, found.dynamics, 1.0)
+    with pytest.raises(RecordingError, match=r"^late: "):
+        check_explained({"late": late}, found.dynamics, 1.0)
+
+
 def test_the_held_out_recording_changes_the_reported_error_alone(
     recordings: dict[str, Episode], found: Identification
 ) -> None:
