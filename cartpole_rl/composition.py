@@ -608,12 +608,9 @@ def _unknown_setting(setting: str, command: str, words: Sequence[str]) -> str:
         if groups[group] is None and group not in map(key_of, words):
             known = ", ".join(group_choices(group))
             return f"{setting}: {group} is not chosen, so it has no settings; give {group}= too: {known}"
-        owners = [
-            name
-            for name, values in group_choices(group).items()
-            if setting in setting_names({group: _with_defaults(group, values)})
-        ]
-        if owners and setting != group:
+        choices = group_choices(group).items() if setting != group else ()
+        named = ((name, setting_names({group: _with_defaults(group, values)})) for name, values in choices)
+        if owners := [name for name, names in named if setting in names]:
             return of_another_choice(setting, owners)
     chosen = [word for word in words if re.fullmatch(r"\w+=[\w.-]+", word)]
     return no_such_setting(setting, known_settings(command, chosen) or known_settings(command, []))

@@ -64,9 +64,13 @@ class CartHead(ctypes.Structure):
     )
 
 
-def of_head(name: str) -> Any:
-    """Return a property that is a field of the cart's head."""
-    return property(attrgetter(f"_head.{name}"), lambda cart, value: setattr(cart._head, name, value))
+def of_head(name: str, is_set: bool = False) -> Any:
+    """Return a property that is a field of the cart's head; with `is_set` it can be set, too."""
+
+    def put(cart: "CFirmware", value: Any) -> None:
+        setattr(cart._head, name, value)
+
+    return property(attrgetter(f"_head.{name}"), put if is_set else None)
 
 
 class CFirmware:
@@ -74,11 +78,10 @@ class CFirmware:
 
     period_us: int = of_head("period_us")  # of the next period
     armed: bool = of_head("armed")  # the cart obeys SET_MOTOR
-    homed: bool = of_head("homed")  # the zeros are set
+    homed: bool = of_head("homed", is_set=True)  # the zeros are set
     homing: bool = of_head("homing")
-    switches: int = of_head(
-        "switches"
-    )  # end switches that are pressed: 1 left, 2 right; set it before each `look`
+    # end switches that are pressed: 1 left, 2 right; set it before each `look`
+    switches: int = of_head("switches", is_set=True)
 
     def __init__(
         self,

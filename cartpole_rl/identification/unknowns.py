@@ -39,7 +39,7 @@ class Unknown(NamedTuple):
 
 
 def unknowns_of(models: Models, known: Sequence[str] = ()) -> list[Unknown]:
-    """Return the unknowns but the `known`: what has a prior and `models` read, and the pole's length."""
+    """Return the unknowns: the pole's length, and what `models` read and has a prior, without the `known`."""
     cart, *others = [Unknown(each.name, each.prior) for each in PARAMETERS.values() if each.prior]
     every = [cart, Unknown(POLE_LENGTH, factor(0.5)), *sorted(others, key=lambda each: each.name in LEVELS)]
     without = {*unused_parameters(models), *known}
