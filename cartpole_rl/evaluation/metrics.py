@@ -9,9 +9,19 @@ from typing import Any
 import numpy as np
 
 from cartpole_rl.settings import CONFIDENCE
-from cartpole_rl.tasks.episode import Ending, Episode, is_upright, upright_at_end, upright_since, wrap
+from cartpole_rl.tasks.episode import (
+    HOLD,
+    Ending,
+    Episode,
+    falls,
+    is_upright,
+    upright_at_end,
+    upright_since,
+    wrap,
+)
 
 RESAMPLES = 5000
+RECOVERY = 5.0  # s that each pole has after a fall
 
 
 def episode_metrics(episode: Episode, track_half_length: float) -> dict[str, Any]:
@@ -24,6 +34,9 @@ def episode_metrics(episode: Episode, track_half_length: float) -> dict[str, Any
     of periods in which the track guard replaced the agent's motor value; `upright_at_end` is 1 if the pole is
     within 5 degrees for the last second of a full-length episode; `min_track_margin_m` the smallest distance
     from the track's end, negative beyond it: from its own on a simulated cart, else from `track_half_length`.
+    `falls` counts how often a pole that had stood for 1 s fell below the horizontal; `recovered_fraction` is
+    the share of them after which it stood again within 5 s, without those too late for that; `recovery_s` and
+    `recovery_swings` are the mean time and the mean number of swings through the hanging position until then.
     Only an episode that the cart's board drove has `same_as_host_fraction`, the share of the compared periods
     with the motor value that this computer would have sent, and `not_compared_steps`, the number of the other
     periods.
@@ -49,7 +62,20 @@ def episode_metrics(episode: Episode, track_half_length: float) -> dict[str, Any
         "motor_reversals_per_s": _reversals_per_s(episode),
         "guarded_fraction": None if episode.guarded is None else float(episode.guarded.mean()),
         "min_track_margin_m": float(end - np.abs(episode.x).max()),
+        **_recovery(episode),
         **_same_as_host(episode),
+    }
+
+
+def _recovery(episode: Episode) -> dict[str, Any]:
+    every = falls(episode.time, episode.theta)
+    timely = [each for each in every if each.moment + RECOVERY + HOLD <= episode.time[-1]]
+    back = [each for each in timely if each.recovery is not None and each.recovery <= RECOVERY]
+    return {
+        "falls": len(every),
+        "recovered_fraction": len(back) / len(timely) if timely else None,
+        "recovery_s": float(np.mean([each.recovery for each in back])) if back else None,
+        "recovery_swings": float(np.mean([each.swings for each in back])) if back else None,
     }
 
 

@@ -27,7 +27,7 @@ MEASURES = {  # key of metrics.json: label
 }
 LOW_IS_GOOD = (  # starts of measures
     *("errors", "rms_", "time_to_", "network_over_", "guarded_fraction", "motor_reversals_per_s"),
-    *("late_ticks", "lost_frames", "bad_frames", "ended_by."),
+    *("late_ticks", "lost_frames", "bad_frames", "ended_by.", "falls", "recovery_"),
 )
 SCORES = get_args(Measure)
 SCORE_DECIMALS = 1  # at most

@@ -21,6 +21,8 @@ SCORES = {  # key in metrics.json: label
     "score_upright": "score upright (6.1)",
     "time_to_upright_s": "time to upright, s",
     "upright_fraction": "share of time upright",
+    "recovered_fraction": "share of falls recovered from",  # None without a fall, as is the next
+    "recovery_s": "recovery after a fall, s",
     "rms_angle_rad": "RMS angle while upright, rad",
     "rms_position_m": "RMS position while upright, m",
     "min_track_margin_m": "nearest to the track's end, m",
@@ -58,7 +60,7 @@ def score_columns(summaries: Mapping[str, Mapping[str, Any]], heading: str) -> s
     """
     rows = []
     for key, label in SCORES.items():
-        means = {name: summary[key] for name, summary in summaries.items()}
+        means = {name: summary.get(key) for name, summary in summaries.items()}
         if any(mean is not None for mean in means.values()):
             texts = {name: mean_text(mean) for name, mean in means.items()}
             if any(" to " in (text or "") for text in texts.values()):

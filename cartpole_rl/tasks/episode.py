@@ -8,7 +8,8 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from enum import StrEnum
-from typing import Any
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -128,6 +129,31 @@ def upright_at_end(time: Array, theta: Array) -> bool:
     """
     last = time >= time[-1] - HOLD
     return bool(time[-1] - time[0] >= HOLD and is_upright(theta[last]).all())
+
+
+class Fall(NamedTuple):
+    """A fall below the horizontal of a pole that had stood for a second (`HOLD`)."""
+
+    moment: float  # s, at which it was last upright
+    recovery: float | None  # s from then until it stands for a second again; None if it does not
+    swings: int  # how often it passes the hanging position in this time, or until the end of the episode
+
+
+def falls(time: Array, theta: Array) -> list[Fall]:
+    """Return the falls of an episode in their order. `time` [T] in s, ascending; `theta` [T] in rad.
+
+    An episode may end with an angle that is not finite.
+    """
+    edges = np.flatnonzero(np.diff(np.pad(is_upright(theta).astype(int), 1))).reshape(-1, 2)
+    stood = [(first, end - 1) for first, end in edges if time[end - 1] - time[first] >= HOLD]
+    turns = np.floor((np.unwrap(theta) + math.pi) / (2 * math.pi))  # changes by 1 at the hanging position
+    found = []
+    for (_, last), (first, _) in pairwise([*stood, (len(time), len(time))]):
+        if (np.cos(theta[last:first]) < 0).any():
+            recovery = float(time[first] - time[last]) if first < len(time) else None
+            swings = int(np.nansum(np.abs(np.diff(turns[last:first]))))
+            found.append(Fall(float(time[last]), recovery, swings))
+    return found
 
 
 def upright_since(time: Array, theta: Array) -> float | None:

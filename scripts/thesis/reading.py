@@ -45,6 +45,7 @@ CURVE_POINTS = 60
 BEHAVIOUR = (
     *("upright_at_end", "time_to_upright_s", "rms_angle_rad", "rms_position_m"),
     *("rms_motor_change", "motor_reversals_per_s"),
+    *("falls", "recovered_fraction", "recovery_s", "recovery_swings"),
     *("parameters.pole_coulomb", "parameters.pole_drag"),
 )
 

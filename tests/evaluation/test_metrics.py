@@ -123,3 +123,34 @@ def test_the_pole_is_upright_at_the_end_if_it_was_during_the_last_second_on_the_
 ) -> None:
     whole = replace(episode(angles), ended_by=ended_by)
     assert episode_metrics(whole, 0.4)["upright_at_end"] == stands
+
+
+@pytest.mark.parametrize(
+    ("after", "falls", "recovered", "seconds", "swings"),
+    [
+        ([80.0] * 10 + [0.0] * 51, 0, None, None, None),  # it stays above the horizontal
+        ([*np.linspace(6, 354, 71), *[360.0] * 300], 1, 1, 72, 1),
+        ([*np.linspace(6, 200, 40), *np.linspace(200, 6, 40), *[0.0] * 300], 1, 1, 81, 2),
+        ([*np.linspace(6, 354, 71), *[360.0] * 40, *[170.0] * 200], 1, 0, None, None),  # upright for 0.8 s
+        ([180.0] * 260 + [0.0] * 60, 1, 0, None, None),  # after 5.2 s
+        ([*np.linspace(6, 354, 71), *[360.0] * 60], 1, None, None, None),  # too late for 5 s to recover in
+        ([180.0] * 300 + [math.nan], 1, 0, None, None),
+    ],
+)
+def test_falls_of_a_pole_that_stood(
+    after: list[float], falls: int, recovered: float | None, seconds: float | None, swings: float | None
+) -> None:
+    """The first upright second is no recovery: the pole has not fallen yet."""
+    metrics = episode_metrics(episode([180.0] * 20 + [0.0] * 51 + after), 0.4)
+    assert metrics["falls"] == falls
+    assert metrics["recovered_fraction"] == recovered
+    assert metrics["recovery_s"] == (seconds and pytest.approx(seconds * PERIOD))
+    assert metrics["recovery_swings"] == swings
+
+
+def test_each_fall_counts_and_recoveries_are_averaged() -> None:
+    fall, stand = [0.0, 120.0, 180.0, 240.0], [360.0] * 60
+    metrics = episode_metrics(episode([0.0] * 60 + fall + stand + fall + [240.0] * 30 + [360.0] * 400), 0.4)
+    assert (metrics["falls"], metrics["recovered_fraction"]) == (2, 1)
+    assert metrics["recovery_s"] == pytest.approx((4 + 34) / 2 * PERIOD)
+    assert metrics["recovery_swings"] == 1
