@@ -342,8 +342,7 @@ class SerialCart:
         check_rig(self.information, self.flags, self.hardware)
         check_limits(self.information, self.hardware)
         self._check_round_trip()
-        self._connection.request(message, Ack)
-        self._tracker.forget_handed_out()
+        self._connection.arm(message)
 
     def _check_round_trip(self) -> None:
         """Raise LinkError if the link takes over a period. On a lockstep emulator no time passes.

@@ -25,7 +25,7 @@ from typing import TypeVar
 from cartpole_rl.errors import LinkError
 from cartpole_rl.plants.serial.errors import LONGEST_PERIOD_US, refusal
 from cartpole_rl.plants.serial.link import SerialLink, WriteTimeoutError, now
-from cartpole_rl.plants.serial.tracking import StateTracker
+from cartpole_rl.plants.serial.tracking import StateTracker, is_newer
 from cartpole_rl.plants.settings import SerialSettings
 from cartpole_rl.rig.hardware import LARGEST_MOTOR
 from cartpole_rl.terminal import beat
@@ -40,6 +40,8 @@ from cartpole_rl.wire.messages import (
     Nack,
     Reason,
     SetMotor,
+    Start,
+    StartPolicy,
     State,
     Stop,
 )
@@ -151,6 +153,11 @@ class Connection:
             f"the cart on {self.link.port} did not answer {message.TYPE.name}, asked {len(asked)} times: "
             "check its cable and power"
         )
+
+    def arm(self, message: Start | StartPolicy) -> None:
+        """Arm the motor; from then on no state from before it is handed out. Raises as `request` does."""
+        self.request(message, Ack)
+        self._tracker.begin_drive(self._asked_sequence)
 
     def learn_clock(self) -> None:
         """Send nothing for as long as a disarmed cart with its own clock needs to be known as one.
@@ -383,8 +390,3 @@ class Connection:
         return (
             f"{link.bytes_received} bytes came, the last bad frame: {link.why_bad}; right port, right baud?"
         )
-
-
-def is_newer(sequence: int, than: int) -> bool:
-    """Return True if the frame of a sequence was sent after that of another, or is the same."""
-    return (sequence - than) % 256 < 128

@@ -174,9 +174,11 @@ class StateTracker:
         """True if the caller has got a state since START."""
         return self._handed_out is not None
 
-    def forget_handed_out(self) -> None:
-        """Note that the motor was armed: the caller has not seen a state of this drive yet."""
+    def begin_drive(self, armed_by: int) -> None:
+        """Note that the frame of a sequence armed the motor: no state from before it is handed out."""
         self._handed_out = None
+        if self._newest is not None and not is_newer(self._newest.last_sequence, armed_by):
+            self._newest = None
 
     def take_newest(self) -> State | None:
         """Return the newest state if it was not returned before."""
@@ -289,6 +291,11 @@ class StateTracker:
         if not went_back(passed_us):  # otherwise the cart has restarted
             until_arrival_us = passed_us - 1000 * state.command_age_ms - HALF_MILLISECOND
             self.statistics.loop_times.append(max(0, until_arrival_us) * 1e-6)
+
+
+def is_newer(sequence: int, than: int) -> bool:
+    """Return True if the frame of a sequence was sent after that of another, or is the same."""
+    return (sequence - than) % 256 < 128
 
 
 class ClockComparison:

@@ -11,7 +11,7 @@ from cartpole_rl.errors import LinkError
 from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.link import now
 from cartpole_rl.wire.frames import Frame
-from cartpole_rl.wire.messages import Hello, SetMotor
+from cartpole_rl.wire.messages import Flags, Hello, SetMotor, Start
 
 
 def leave_unread(peer: CartPeer, waiting: int, thrown_away: int) -> None:
@@ -30,6 +30,19 @@ def host_clock(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     for module in ("cart", "connection", "link"):
         monkeypatch.setattr(f"cartpole_rl.plants.serial.{module}.now", lambda: now() + clock.ahead)
     return clock
+
+
+def test_no_state_from_before_start_is_handed_out(host_clock: SimpleNamespace) -> None:
+    class Slow(CartPeer):
+        def answer(self, frame: Frame) -> Iterable[bytes]:
+            answers = list(super().answer(frame))
+            return answers[:1] if isinstance(frame.message, Start) else answers  # no state
+
+    with Slow() as peer, SerialCart(quick_settings(peer.port, timeout=5.0)) as cart:
+        cart.start()
+        host_clock.ahead = 0.05  # s: the state is overdue
+        cart.get_state()
+        assert Flags.ARMED in cart.flags
 
 
 def test_the_newest_of_several_is_returned_and_the_others_are_late() -> None:
