@@ -121,6 +121,9 @@ class EmulatorSettings(Settings):
         def plus(name: str) -> float:
             return getattr(default, name) + numbers[name] - of_ip02[name]
 
+        def coulomb(name: str, side: int) -> float:
+            return times(name, "cart_coulomb") * (1 + side * numbers["cart_coulomb_asymmetry"])
+
         def wide(name: str) -> float:
             start = zero_force_motor(numbers) / zero_force_motor(of_ip02)
             return min(LARGEST_MOTOR, max(start * getattr(default, name), numbers[name]))
@@ -130,9 +133,9 @@ class EmulatorSettings(Settings):
             "track_half_length": default.track_half_length
             + hardware.half_span
             - nominal_hardware().half_span,
-            "cart_coulomb_left": times("cart_coulomb_left", "cart_coulomb"),
-            "cart_coulomb_right": times("cart_coulomb_right", "cart_coulomb"),
-            "pole_coulomb": times("pole_coulomb", "pole_viscous"),
+            "cart_coulomb_left": coulomb("cart_coulomb_left", -1),
+            "cart_coulomb_right": coulomb("cart_coulomb_right", 1),
+            "pole_coulomb": times("pole_coulomb", "pole_viscous") + numbers["pole_coulomb"],
             "force_curve": (
                 numbers["force_quadratic"],
                 slope * numbers["force_linear"] / of_ip02["force_linear"],

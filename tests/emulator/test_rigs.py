@@ -192,7 +192,7 @@ def test_a_rig_survives_json_and_leaves_a_chosen_track() -> None:
     assert EmulatorSettings().of_cart({}).track_half_length == DEFAULT.track_half_length
 
 
-def test_delays_tilt_and_deadband_of_the_file_are_emulated() -> None:
+def test_delays_tilt_deadband_and_dry_friction_of_the_file_are_emulated() -> None:
     """On top of the default cart's own, whose latency is 2 ms below that of ip02."""
     file = {
         "track_span": 0.5,
@@ -204,12 +204,16 @@ def test_delays_tilt_and_deadband_of_the_file_are_emulated() -> None:
         "force_asymmetry": -0.1,
         "deadband_left": 70.0,
         "cart_stiction_ratio": 1.5,
+        "cart_coulomb_asymmetry": 0.2,
+        "pole_coulomb": 1e-4,
     }
     cart = EmulatorSettings().of_cart(file)
     assert (cart.latency, cart.latency_jitter) == pytest.approx((0.013, 0.003))
     assert (cart.motor_time_constant, cart.track_tilt) == pytest.approx((0.025, -0.008))
     assert (cart.angle_offset, cart.force_asymmetry) == pytest.approx((0.034, -0.07))
     assert (cart.deadband_left, cart.deadband_right, cart.cart_stiction_ratio) == (70.0, 60.0, 1.5)
+    assert (cart.cart_coulomb_left, cart.cart_coulomb_right) == pytest.approx((0.8 * 0.58, 1.2 * 0.53))
+    assert cart.pole_coulomb == pytest.approx(3e-4)
     assert EmulatorSettings().of_cart({**file, "latency": 0.0}).latency == 0.0
     with pytest.raises(ConfigError, match=r"of cart=: emulator\.force_asymmetry=0\.91: give at most 0\.9$"):
         EmulatorSettings().of_cart({**file, "force_asymmetry": 0.88})
