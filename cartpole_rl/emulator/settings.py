@@ -23,6 +23,8 @@ ONBOARD = Path("onboard")  # as `policy`: the agent that is evaluated
 Port = Literal["auto", "pty", "tcp"]
 MotorValue = Annotated[float, Field(ge=0, le=LARGEST_MOTOR)]
 Coefficient = Annotated[float, Field(allow_inf_nan=False)]
+Mass = Annotated[float, Field(ge=1e-6, allow_inf_nan=False)]  # kg; MuJoCo takes none near 0
+Inertia = Annotated[float, Field(ge=1e-11, allow_inf_nan=False)]  # kg m^2; likewise
 # numbers of a file that the emulated cart has, and that scale those of the default cart or are added to them
 TAKEN = ("backdrivability", "coasting")
 SCALED = ("cart_mass", "cart_viscous", "pole_viscous", "pole_drag")
@@ -42,10 +44,10 @@ class EmulatorSettings(Settings):
     given: tuple[str, ...] = ()  # settings that cart= does not replace: those that the user gave
     seed: Annotated[int, Field(ge=0)] = 0  # of latencies, disturbed frames, boot position, the hand's angle
 
-    cart_mass: Positive = 0.735  # kg, rotor included
-    pole_mass: Positive = 0.129  # kg
+    cart_mass: Mass = 0.735  # kg, rotor included
+    pole_mass: Mass = 0.129  # kg
     pole_com: Positive = 0.1765  # m, pivot to centre of mass
-    pole_inertia: Positive = 1.22e-3  # kg m^2, about the centre of mass
+    pole_inertia: Inertia = 1.22e-3  # kg m^2, about the centre of mass
     track_half_length: Annotated[float, Field(ge=0.05, le=10)] = 0.409  # m, middle to a stop or an end switch
 
     cart_viscous: NonNegative = 0.65  # N s/m
