@@ -39,9 +39,10 @@ from cartpole_rl.exits import OF_HYDRA, exit_with_message, is_defect, one_line
 from cartpole_rl.files import write_text
 from cartpole_rl.run_folder import CONFIG, ERROR, MULTIRUN
 from cartpole_rl.settings import Settings
-from cartpole_rl.terminal import print_message, program
+from cartpole_rl.terminal import as_word, print_message, program
 
 MODES = MULTIRUN_FLAGS | {"-r", "--run", "-c", "--cfg", "-i", "--info", "-sc", "--shell-completion"}
+REPORTED = ("train", "finetune", "evaluate")  # commands whose runs cartpole-report compares
 NOT_ENDED = "it was killed or interrupted, or is still running"
 
 SQLITE = "sqlite:///"  # before the path of a study of Optuna's
@@ -207,6 +208,7 @@ def run_as_job(name: str, folder: Path, work: Callable[[], float | None]) -> flo
     if not HydraConfig.get().job.chdir:
         os.chdir(HydraConfig.get().runtime.cwd)  # on a cluster, a worker may start in another folder
     write_text(folder / ERROR, f"{NOT_ENDED}\n")
+    print_message(name, f"job {folder.name}")
     try:
         result = work()
     except Exception as error:
@@ -222,6 +224,7 @@ def run_as_job(name: str, folder: Path, work: Callable[[], float | None]) -> flo
 def sweep(name: str, schema: type[Settings]) -> Iterator[None]:
     """Check the jobs of a sweep by `schema`; at its end, name the failed ones and exit with 1 for any.
 
+    Without one, print the command that compares them.
     The launcher itself fails if the process of a job is killed. What it raises is named too.
     """
     logging.getLogger("hydra_plugins").setLevel(logging.ERROR)  # failed jobs are named here
@@ -236,6 +239,10 @@ def sweep(name: str, schema: type[Settings]) -> Iterator[None]:
         sys.exit(CartPoleError.exit_code)
     if _report(name):
         sys.exit(CartPoleError.exit_code)
+    if (jobs := _jobs()) and name in REPORTED:
+        folder = os.path.relpath(jobs[0].parent)
+        print(f"{folder}/ holds {len(jobs)} runs; next:")
+        print(f"{program('report')} {as_word('runs', folder)}")
 
 
 def _report(name: str) -> int:

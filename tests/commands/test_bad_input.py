@@ -268,7 +268,7 @@ def test_without_a_compiler_the_remedy_is_stated(tmp_path: Path, monkeypatch: py
 def test_in_a_multirun_the_other_jobs_run(tmp_path: Path) -> None:
     done = in_process("train", "-m", *TINY, ONCE, "cart.cart_mass=-1,0.9", folder=tmp_path)
     assert done.code == 1
-    assert "cart_mass is -1; it must be above 0" in done.err.splitlines()[0]
+    assert "cart_mass is -1; it must be above 0" in done.err.splitlines()[1]
     assert "Traceback" not in done.err
     finished = list(tmp_path.glob("runs/train/*_multirun/*/metrics.json"))
     assert [path.parent.name for path in finished] == ["1_cart.cart_mass-0.9"]

@@ -77,6 +77,13 @@ def test_a_defect_in_a_job_leaves_its_traceback(tmp_path: Path, monkeypatch: pyt
     assert "Traceback" in error.read_text()
 
 
+def test_a_sweep_names_its_jobs_and_the_command_that_compares_them(tmp_path: Path) -> None:
+    words = ("-m", "seed=0,1", "hydra.sweep.dir=sweep")
+    done = in_process("train", *words, folder=tmp_path, function=lambda folder: (folder / "run").touch())
+    assert done.err.splitlines() == ["cartpole-train: job 0_seed-0", "cartpole-train: job 1_seed-1"]
+    assert done.out.splitlines() == ["sweep/ holds 2 runs; next:", "cartpole-report runs=sweep"]
+
+
 def test_a_sweep_leaves_the_runs_of_an_earlier_one_alone(tmp_path: Path) -> None:
     (run := tmp_path / "sweep/1_seed-1").mkdir(parents=True)
     (run / "config.yaml").touch()
