@@ -119,6 +119,8 @@ def next_command(evaluation: Evaluation) -> str:
             own = pole.name not in POLES
             plant = "plant=emulated emulator=<yours>.yaml" if own else emulated_words([pole])
         return " ".join(["cartpole-identify", *of_cart, plant])
+    if is_own_policy(config.run):  # what a trained agent has from its checkpoint
+        run = " ".join([run, *words_given("cart", "observation", "actions", "control_period")])
     if not config.plant.is_on_port:
         poles = known if config.pole is None and known else [evaluation.settings.pole]
         return f"cartpole-evaluate {run} {emulated_words(poles)}"

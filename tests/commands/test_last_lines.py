@@ -47,6 +47,25 @@ def test_an_evaluation_leads_to_the_cart(words: tuple[str, ...], following: str,
     compose(last)
 
 
+@pytest.mark.parametrize(
+    ("plant", "following"),
+    [
+        (("plant=simulated",), "cartpole-evaluate run=last_pushes:push {} plant=emulated"),
+        (("plant=emulated", COARSE), f"cartpole-record run=last_pushes:push {{}} plant=emulated {COARSE}"),
+    ],
+)
+def test_an_own_policy_keeps_what_it_sees_and_does(
+    plant: tuple[str, ...], following: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "last_pushes.py").write_text("push = lambda observation: observation[:, 0] > 0\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    told = ("observation=raw", "actions=three", "control_period=0.01")
+    words = ("run=last_pushes:push", *told, "episodes=1", "task=swingup", "task.time_limit=5", *plant)
+    done = in_process("evaluate", *words, folder=tmp_path)
+    assert done.code == 0, done.err
+    assert done.out.splitlines()[-1].replace("0.001", "1e-3") == following.format(" ".join(told))
+
+
 def test_an_agent_on_another_pole_is_told_which_cart_has_its_own(tmp_path: Path) -> None:
     words = ("plant=emulated", COARSE, "task=swingup", "task.time_limit=5", "episodes=1")
     done = in_process("evaluate", "run=pretrained/large", *words, folder=tmp_path)
