@@ -19,8 +19,10 @@ TAGS = re.compile(
 )
 NEAR = 0.8  # similarity of two names, 0 to 1, from which one is suggested for the other
 NEAR_VALUE = 0.6  # similarity from which a value is suggested
+MOST_NAMES = 12  # of a group that a message lists
 SAME_GROUP = 0.15  # added to the similarity within one group
 NAMELESS = "pole: the numbers of a pole stand under its name: choices: {mine: {pole_mass: ...}}"
+SYNONYMS = {"gpu": "cuda"}  # which is spelt more like cpu
 EXAMPLES = {  # of required settings
     "run": "run=runs/train/<run> or run=pretrained/medium",
     "format": "format=weights, onnx, c, web, firmware, minari or mcap",
@@ -128,6 +130,8 @@ def _meant(detail: Mapping[str, Any]) -> str:
     choices = re.findall(r"'([^']+)'", str(detail.get("ctx", {}).get("expected", "")))
     if not choices or not isinstance(detail["input"], str):
         return ""
+    if (meant := SYNONYMS.get(detail["input"])) in choices:
+        return f"did you mean {meant}? "
     near = most_similar(detail["input"], choices)
     return f"did you mean {near}? " if similarity(detail["input"], near)[0] >= NEAR_VALUE else ""
 
@@ -155,8 +159,9 @@ def kinds(schema: type[Settings], field: str) -> list[str]:
 
 
 def no_such_setting(key: str, known: Iterable[str]) -> str:
-    """Return the message for an unknown setting, with the most similar one if there is any."""
+    """Return the message for an unknown setting, with the most similar one, or with those of its group."""
     above, _, wrong = key.rpartition(".")
+    known = sorted(known)
     if above == "parameters":
         return f"{key}: numbers of the cart are given together, as 'parameters={{{wrong}:...}}'"
 
@@ -165,11 +170,15 @@ def no_such_setting(key: str, known: Iterable[str]) -> str:
         ratio, letters = similarity(wrong, name)
         return ratio + SAME_GROUP * (place == above), letters, place == "plant"  # rather than emulator
 
-    nearest = max(sorted(known), key=similar, default="")
-    near = bool(nearest) and similar(nearest)[0] > NEAR
-    return f"{key}: there is no such setting; " + (
-        f"did you mean {nearest}?" if near else "--cfg job shows the settings"
-    )
+    nearest = max(known, key=similar, default="")
+    beside = [name for place, _, name in (each.rpartition(".") for each in known) if place == above]
+    if nearest and similar(nearest)[0] > NEAR:
+        hint = f"did you mean {nearest}?"
+    elif above and 0 < len(beside) <= MOST_NAMES:
+        hint = f"{above} has {', '.join(beside)}"
+    else:
+        hint = "--cfg job shows the settings"
+    return f"{key}: there is no such setting; {hint}"
 
 
 def of_another_choice(key: str, choices: Sequence[str]) -> str:

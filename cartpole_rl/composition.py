@@ -572,7 +572,8 @@ def error_message(error: Exception, command: str, words: Sequence[str], plants: 
         return reason_of(error)
     text = " ".join(str(error).split())
     if unknown := re.match(r"Could not override '([^']+)'", text):
-        setting = getattr(error.__cause__, "full_key", None) or unknown[1]  # the key inside of a mapping
+        inside = getattr(error.__cause__, "full_key", None) or ""  # the key inside of a mapping
+        setting = max(unknown[1], inside, key=len)  # of a group without a choice it is the group alone
         return _unknown_setting(setting, command, words)
     if wrong := re.search(r"Could not find '([^']+)' Available options in '([^']+)': (.*)", text):
         name = wrong[1].removeprefix(f"{wrong[2]}/")
@@ -580,6 +581,9 @@ def error_message(error: Exception, command: str, words: Sequence[str], plants: 
             return f'{wrong[2]}={name} needs the extra {extra}: pip install "cartpole_rl[{extra}]"'
         if Path(f"{name}.yaml").is_file():
             return f"{wrong[2]}={name}: there is no such choice; did you mean {wrong[2]}={name}.yaml?"
+        if wrong[2] in FRICTIONS and ":" in name:
+            own = f"give {wrong[2]}=mine.yaml, a file with 'model: {name}' and 'parameters: {{}}'"
+            return f"{wrong[2]}={name}: there is no such choice; for a law of your own {own}"
         choices = wrong[3].split(" Config search")[0].split()
         if wrong[2] == "plant" and plants:
             choices = [each for each in choices if each in plants or not is_shipped("plant", each)]
@@ -613,7 +617,8 @@ def _unknown_setting(setting: str, command: str, words: Sequence[str]) -> str:
         if owners := [name for name, names in named if setting in names]:
             return of_another_choice(setting, owners)
     chosen = [word for word in words if re.fullmatch(r"\w+=[\w.-]+", word)]
-    return no_such_setting(setting, known_settings(command, chosen) or known_settings(command, []))
+    settings = known_settings(command, chosen) or known_settings(command, [])
+    return no_such_setting(setting, settings | groups.keys())
 
 
 def known_settings(command: str, words: Sequence[str]) -> set[str]:

@@ -22,6 +22,12 @@ WRONG_TRAINING = [
     ("experiment medium", "experiment medium", "did you mean experiment=medium?"),
     ("learning.epsilon=0.5", "learning.epsilon=0.5", "give a list, as [0.5]"),
     ("learning.epsilon=[0.5]", "learning.epsilon: ", "value 2 is missing"),
+    (
+        "cart_friction=my_laws:smooth",
+        "cart_friction=my_laws:smooth",
+        "'model: my_laws:smooth' and 'parameters: {}'",
+    ),
+    ("device=gpu", "device=gpu", "did you mean cuda?"),
     ("agent.mirrored=maybe", "agent.mirrored=maybe", "give true or false"),
     ("label=a(b", "label=a(b", "text with special characters in quotes"),
     ("emulator=large", "emulator: ", "cartpole-train does not read this group"),

@@ -4,6 +4,7 @@ import errno
 
 import pytest
 from hydra.errors import HydraException
+from omegaconf.errors import ConfigKeyError
 
 from cartpole_rl.choices import WHOLE, default_choices
 from cartpole_rl.command import wrong_option
@@ -47,6 +48,26 @@ def test_a_setting_of_a_group_that_is_not_chosen_names_its_choices() -> None:
         "task.time_limit: task is not chosen, so it has no settings; give task= too: balance, swingup"
     )
     assert "no such setting" in hydra_complaint("Could not override 'task.time_limt'.", "train")
+
+
+def test_a_setting_of_a_group_without_a_choice_is_named_in_full() -> None:
+    error = HydraException("Could not override 'task.time_limit'.")
+    error.__cause__ = ConfigKeyError("full_key: task")
+    error.__cause__.full_key = "task"
+    assert error_message(error, "evaluate", ()).startswith("task.time_limit: task is not chosen")
+
+
+@pytest.mark.parametrize(
+    ("key", "hint"),
+    [
+        ("experment", "did you mean experiment?"),
+        ("optimizer.lr", "optimizer has kind, learning_rate, learning_rate_end, max_grad_norm, weight_decay"),
+        ("learning.foo", "--cfg job shows the settings"),  # too many to list
+    ],
+)
+def test_an_unknown_setting_is_told_what_there_is(key: str, hint: str) -> None:
+    text = f"Could not override '{key}'."
+    assert hydra_complaint(text, "train") == f"{key}: there is no such setting; {hint}"
 
 
 @pytest.mark.parametrize("command", ["train", "evaluate"])
