@@ -39,7 +39,7 @@ from cartpole_rl.exits import (
 from cartpole_rl.run_folder import CHECKPOINTS, RESUME, use_of
 from cartpole_rl.settings import Settings
 from cartpole_rl.sweeps import as_multirun, is_job, run_as_job, shown_jobs, sweep
-from cartpole_rl.terminal import noting, program, waiting
+from cartpole_rl.terminal import noting, program, shown, waiting
 
 if TYPE_CHECKING:
     from cartpole_rl.cli import Verb
@@ -103,7 +103,7 @@ def run_job(
         except (*EXPECTED, KeyboardInterrupt, Terminated) as ended:
             interrupted = isinstance(ended, (*FAILED, KeyboardInterrupt, Terminated))
             if interrupted and (folder / CHECKPOINTS / RESUME).exists():
-                ended.add_note(use_of(folder, name))
+                ended.add_note(use_of(shown(folder), name))
             if isinstance(ended, EXPECTED):
                 exit_with_message(name, ended)
             raise

@@ -13,7 +13,7 @@ from cartpole_rl.reporting.sweeps import read_groups, results_of
 from cartpole_rl.reporting.tables import episode_rows, run_rows, write_table
 from cartpole_rl.reporting.texts import count_text
 from cartpole_rl.run_folder import EPISODES, FIGURES, PAGE, TABLE, write_config
-from cartpole_rl.terminal import print_message
+from cartpole_rl.terminal import print_message, shown
 from cartpole_rl.workflows.checks import check_installed
 from cartpole_rl.workflows.config import ReportConfig
 
@@ -39,7 +39,7 @@ def make_report(config: ReportConfig, folder: Path) -> None:
     title = " and ".join(f"{name}: {', '.join(sources)}" for name, sources in given.items())
     pictures = pictures_of(results) if config.animations else {}
     write_text(folder / PAGE, runs_page(title, results, pictures, between))
-    print(f"{folder}/{TABLE} holds all runs" + "".join(f", {name} all episodes" for name in tables))
+    print(f"{shown(folder)}/{TABLE} holds all runs" + "".join(f", {name} all episodes" for name in tables))
     if config.figures:
         write_figures({f"{each.name}_{one.name}": one for each in results for one in drawings(each)}, folder)
     print_end(results, folder)
@@ -60,7 +60,11 @@ def write_figures(figures: Mapping[str, Drawing], folder: Path) -> None:
     """Write figures as SVG files by their names, and print where they are."""
     for name, drawing in figures.items():
         save(drawing.figure, folder / FIGURES / f"{name}.svg")
-    print(f"{folder}/{FIGURES}/ holds {len(figures)} figures" if figures else "there is no figure to write")
+    print(
+        f"{shown(folder)}/{FIGURES}/ holds {len(figures)} figures"
+        if figures
+        else "there is no figure to write"
+    )
 
 
 def print_end(results: Sequence[Results], folder: Path) -> None:
@@ -70,4 +74,4 @@ def print_end(results: Sequence[Results], folder: Path) -> None:
     where = "; the page says why" if others else ""
     count = f"{count_text(counting, 'run')} {'counts' if counting == 1 else 'count'}"
     print(f"{count}, {others} {'does' if others == 1 else 'do'} not{where}")
-    print(f"{folder}/{PAGE} is written")
+    print(f"{shown(folder)}/{PAGE} is written")

@@ -159,7 +159,7 @@ def test_a_resumed_run_reaches_its_cart_on_another_port(
 
     monkeypatch.setattr("cartpole_rl.workflows.finetune.drive_all", fail)
     done = in_process("finetune", *words, folder=tmp_path)
-    hint = f"cartpole-finetune resume={tmp_path}/run continues it"
+    hint = "cartpole-finetune resume=run continues it"
     assert done.complaint == f"cartpole-finetune: /dev/gone 3 200.0 1.0; {hint}"
     assert done.code == 1
     done = in_process("finetune", "resume=run", "plant.timeout=2", folder=tmp_path)

@@ -21,6 +21,7 @@ def test_a_browser_shows_the_page_of_two_sets_of_runs(study: Path) -> None:
     words = ("runs=quick/friction/little", "compare=quick/friction/much", "measure=score_upright")
     done, page = report(*words, "figures=true")
     assert done.code == 0, done.err
+    assert done.out.splitlines()[-1] == "report/page.html is written"
     assert all(source.startswith("data:image/") for source in loaded(page))
     found = shown(page, "--window-size=500,900")
     assert (found["errors"], found["console"], found["lost"]) == ([], [], [])
