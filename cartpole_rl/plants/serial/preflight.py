@@ -355,8 +355,8 @@ def latency(probe: Probe) -> str:
             "look for a ramp or a filter in the motor driver, and for play in the gears",
         )
     return (
-        f"the cart begins to move {middle * 1e3:.0f} ms after it took a motor value; the first state that "
-        f"knew of the value had a command age of {age * 1e3:.0f} ms"
+        f"the cart begins to move {middle * 1e3:.0f} ms after it took a motor value, "
+        f"and confirms the value after {age * 1e3:.0f} ms"
     )
 
 

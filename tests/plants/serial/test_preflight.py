@@ -88,7 +88,7 @@ def test_what_is_measured_is_the_truth(probe: Probe) -> None:
     assert 80 < probe.deadband[-1] < 88
     words = latency(probe)
     assert 11 <= float(words.split(" ms")[0].split()[-1]) <= 15
-    assert "command age of 20 ms" in words
+    assert "confirms the value after 20 ms" in words
     assert "not reached" in soft_limit(probe)
     assert probe.farthest * 22749e-9 < 0.05
 
