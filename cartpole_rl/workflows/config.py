@@ -140,6 +140,8 @@ class TrainConfig(RunSettings, CartPoleSettings):
 
     @model_validator(mode="after")
     def _learning_fits(self) -> Self:
+        if self.resume is not None:  # the resumed run's own settings hold
+            return self
         learning = self.learning.at(self.control_period)
         if learning.iterations < learning.evaluations:
             raise ValueError(

@@ -45,6 +45,11 @@ WRONG_TRAINING = [
     ),
     ("learning.return_time=1", "learning.return_time=1 s is 50 control periods", "give at most 0.4"),
     ("learning.transitions=100", "learning.transitions=100 is too few", "or fewer evaluations"),
+    (
+        "resume=a learning.transitions=100",
+        "resume uses that run's own config",
+        "leave out learning.transitions=100",
+    ),
     ("agent.target_period=10", "agent", "either target_tau or target_period"),
     ("actions.motors=[100,100]", "actions", "two or more different values"),
     ("plant=emulated", "plant=emulated: ", "use cartpole-evaluate for plant=emulated"),
