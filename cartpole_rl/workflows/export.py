@@ -56,7 +56,7 @@ def export(config: ExportConfig, folder: Path, words: Sequence[str] = ()) -> Non
     write_config(folder, "export", {**config.model_dump(mode="json"), "seed": None})
     for name, content in contents.items():
         write_bytes(folder / name, content)
-    files = " and ".join(f"{folder}/{name}" for name in contents)
+    files = " and ".join(f"{shown(folder)}/{name}" for name in contents)
     print(f"{files} {'are' if len(contents) > 1 else 'is'} written; SHA-256 of the agent: {agent.checksum}")
 
 
@@ -88,7 +88,8 @@ def write_rig(config: ExportConfig, folder: Path, words: Sequence[str]) -> None:
     header = rig_header(hardware_of(cart), source, lever_um(completed(with_shaking_pole(cart, pole))))
     write_config(folder, "export", {**config.model_dump(mode="json"), "seed": None})
     write_text(folder / RIG_HEADER, header)
-    print(f"{folder}/{RIG_HEADER} is written; build the firmware with RIG={(folder / RIG_HEADER).resolve()}")
+    place = folder / RIG_HEADER
+    print(f"{shown(place)} is written; build the firmware with RIG={place.resolve()}")
     if config.pole is None:
         print("its brake allows for Quanser's medium pole; give pole= for another one")
 

@@ -222,7 +222,7 @@ def regress(
         for name, each in estimates.items()
     ]
     print(table(rows, ["parameter", "estimate", "prior"]))
-    print(f"{folder}/{IDENTIFIED} is written; these values are for comparison, not to train on")
+    print(f"{shown(folder)}/{IDENTIFIED} is written; these values are for comparison, not to train on")
 
 
 def record_experiments(config: IdentifyConfig, folder: Path) -> None:
