@@ -21,6 +21,13 @@ from serial.urlhandler.protocol_socket import Serial as SocketPort
 
 from cartpole_rl.errors import PortError
 
+try:
+    import termios
+
+    TERMINAL_ERROR: type[Exception] = termios.error  # no OSError: the device vanished while it was opened
+except ImportError:  # Windows
+    TERMINAL_ERROR = OSError
+
 READ_SLICE = 0.01  # s that one read blocks at most; callers look at their own clocks in between
 AUTO = "auto"
 PSEUDO_TERMINAL = re.compile(r"/dev/(pts/\d+|ttys\d{3})")
@@ -83,6 +90,8 @@ def open_port(port: str, baud: int, write_timeout: float) -> serial.SerialBase:
         raise PortError(why_not_open(port, error)) from error
     except WRONG_URL as error:
         raise PortError(f"{port} is neither a device path nor a URL of pyserial: {error!r}") from error
+    except TERMINAL_ERROR as error:
+        raise PortError(why_not_open(port, OSError(*error.args))) from error
     set_exclusive(line, True)
     return line
 
@@ -98,7 +107,6 @@ def set_exclusive(line: serial.SerialBase, exclusive: bool) -> None:
         return
     with suppress(ImportError, OSError):
         import fcntl
-        import termios
 
         if not PSEUDO_TERMINAL.fullmatch(os.ttyname(descriptor)):
             fcntl.ioctl(descriptor, termios.TIOCEXCL if exclusive else termios.TIOCNXCL)

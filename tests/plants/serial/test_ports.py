@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from serial import Serial
 from serial.tools.list_ports_common import ListPortInfo
 from serial_peer import CartPeer, Peer, quick_settings
 
@@ -190,6 +191,21 @@ def test_a_url_that_cannot_be_opened_is_named_in_one_line(port: str, words: str)
     assert words in str(raised.value)
     assert str(raised.value).startswith(port)
     assert "\n" not in str(raised.value)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="pyserial's port of POSIX")
+def test_a_device_that_vanishes_while_it_is_opened_may_come_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A lost cart is looked for again after a PortError alone."""
+    with Peer() as peer:
+        last_step = Serial._reset_input_buffer
+
+        def unplugged(line: Serial) -> None:
+            peer.unplug()
+            last_step(line)
+
+        monkeypatch.setattr(Serial, "_reset_input_buffer", unplugged)
+        with pytest.raises(PortError, match=f"^{peer.port} cannot be opened .*Input/output error$"):
+            open_port(peer.port, 921600, 1.0)
 
 
 TIOCGEXCL = 0x80045440  # of Linux; Python's termios does not have it
