@@ -52,7 +52,7 @@ class LiveView:
     def __exit__(self, *_: object) -> None:
         if self.memory is None:
             return
-        self._process.terminate()
+        self._process.kill()  # it has nothing to save, and may be suspended
         self._process.join()
         with suppress(OSError):  # the terminal is closed
             put(f"{SAVE}{ALL_LINES}{RESTORE}")

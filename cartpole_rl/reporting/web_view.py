@@ -96,7 +96,7 @@ class WebView:
         return self
 
     def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
-        self._process.terminate()
+        self._process.kill()  # it has nothing to save, and may be suspended
         self._process.join()
         self._listener.close()
         if error is not None and self._stopped.value:

@@ -2,6 +2,7 @@
 
 import os
 import pty
+import signal
 import sys
 import termios
 import threading
@@ -86,6 +87,7 @@ def test_it_is_drawn_while_the_cart_is_driven_and_gives_the_terminal_back(
             terminal.wait_for("emulated cart: episode 2, step 120")
             assert ALL_LINES not in terminal.text
             assert "\x1b[8;40r" in terminal.text  # of this terminal; stdout is another file
+            os.kill(live._process.pid, signal.SIGSTOP)  # it is ended, too
         terminal.wait_for(ALL_LINES)
     assert GREEN not in terminal.text
 

@@ -2,6 +2,8 @@
 
 import http.client
 import json
+import os
+import signal
 import subprocess
 import time
 from collections.abc import Callable, Iterator
@@ -101,6 +103,12 @@ def test_it_answers_its_own_computer_alone() -> None:
         ):
             assert ask(address, method, name, **headers)[0] == status, (method, name, headers)
         assert urlsplit(view.address).hostname == "127.0.0.1"
+
+
+def test_a_page_whose_process_is_suspended_holds_up_nothing() -> None:
+    with WebView("cart", 0.36) as view:
+        os.kill(view._process.pid, signal.SIGSTOP)
+    assert not view._process.is_alive()
 
 
 def press(address: str) -> None:

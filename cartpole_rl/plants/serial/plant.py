@@ -155,8 +155,9 @@ class SerialPlant(OneCartPlant):
             if self.before_start is not None:
                 self.before_start()
             self._state = self._armed()
-        except LinkError as error:
-            if why := self._why_lost():
+        except BaseException as error:
+            self.halt()  # at once: what unwinds before `close`, such as a view, may block
+            if isinstance(error, LinkError) and (why := self._why_lost()):
                 raise LinkError(why) from error
             raise
         self._turns = self._whole_turns()
@@ -167,16 +168,12 @@ class SerialPlant(OneCartPlant):
         return self._frame(self._preparation.control_period)
 
     def _armed(self) -> State:
-        """Arm the cart and return the next state. After an error, a signal too, it is disarmed again."""
-        try:
-            if self.on_board:
-                self.cart.start_policy()
-            else:
-                self.cart.start()
-            return self.cart.get_state()
-        except BaseException:
-            self.halt()
-            raise
+        """Arm the cart and return the next state."""
+        if self.on_board:
+            self.cart.start_policy()
+        else:
+            self.cart.start()
+        return self.cart.get_state()
 
     def step_one(self, motor: int) -> PlantOutput[Numbers]:
         """Send a motor value; return the frame at the end of the period.

@@ -1,5 +1,6 @@
 """The plant on a scripted cart: endings, clocks and faults. On emulated carts: test_recentring.py."""
 
+import signal
 import threading
 from collections.abc import Iterable, Iterator
 from contextlib import closing
@@ -8,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from serial_peer import HANGING, CartPeer, quick_settings
+from serial_peer import HANGING, CartPeer, HomingForever, quick_settings
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
@@ -16,8 +17,20 @@ from cartpole_rl.errors import FaultError, LinkError, PortError
 from cartpole_rl.plants.serial.errors import NotReadyError
 from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.rig.hardware import nominal_hardware
+from cartpole_rl.signals import send_to_main_thread
 from cartpole_rl.wire.frames import Frame
-from cartpole_rl.wire.messages import ClearFault, Fault, Flags, Home, Nack, Reason, SetMotor, Start, Stop
+from cartpole_rl.wire.messages import (
+    ClearFault,
+    Fault,
+    Flags,
+    Home,
+    Message,
+    Nack,
+    Reason,
+    SetMotor,
+    Start,
+    Stop,
+)
 
 
 @pytest.fixture
@@ -65,6 +78,22 @@ def test_a_reset_that_fails_after_start_disarms_the_cart(on_board: bool) -> None
         with pytest.raises(LinkError, match="no state came"):
             plant.reset()
         assert not peer.flags & Flags.ARMED
+
+
+class InterruptedHoming(HomingForever):
+    """A cart that homes until it is stopped; Ctrl-C is pressed as soon as it homes."""
+
+    def carry_out(self, message: Message) -> None:
+        super().carry_out(message)
+        if isinstance(message, Home):
+            send_to_main_thread(signal.SIGINT)
+
+
+def test_ctrl_c_stops_a_cart_that_homes_before_anything_else_ends() -> None:
+    with InterruptedHoming() as peer, closing(SerialPlant(quick_settings(peer.port))) as plant:
+        with pytest.raises(KeyboardInterrupt):
+            plant.reset()
+        assert not peer.flags & Flags.HOMING  # though the plant is still open
 
 
 def hear_only_stop(peer: CartPeer) -> None:
