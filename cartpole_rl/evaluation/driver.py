@@ -118,10 +118,10 @@ class Driver:
 
 @contextmanager
 def _alive() -> Iterator[None]:
-    """Raise LinkError if the other end of the pipe is closed."""
+    """Raise LinkError if the other end of the pipe is closed, also in the middle of a message."""
     try:
         yield
-    except (EOFError, ConnectionError):
+    except (EOFError, OSError):
         raise LinkError("the process that drives the cart has died") from None
 
 

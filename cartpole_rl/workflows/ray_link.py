@@ -117,7 +117,7 @@ class LearnerLink:
         try:
             while self._pipe.poll():
                 self._receive(self._pipe.recv())
-        except (EOFError, ConnectionError):
+        except (EOFError, OSError):  # also in the middle of a message
             self._lose(self._ending or "its process on this machine ended")
             if time.monotonic() - self._started > PAUSE:
                 self._restart()

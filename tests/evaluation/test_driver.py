@@ -1,7 +1,10 @@
 """The driving process on a scripted cart: confirmation and exit."""
 
+import fcntl
 import os
 import signal
+import sys
+import termios
 import threading
 import time
 from collections.abc import Iterator
@@ -10,7 +13,7 @@ from functools import partial
 
 import pytest
 import torch
-from serial_peer import CartPeer
+from serial_peer import CartPeer, wait_for
 from torch import nn
 
 from cartpole_rl.agents.settings import AgentSettings
@@ -24,17 +27,20 @@ from cartpole_rl.evaluation.driving_policy import as_weights
 from cartpole_rl.learning.agent import QAgent
 from cartpole_rl.plants.serial.plant import SerialPlant
 from cartpole_rl.plants.serial.preparation import Confirm
+from cartpole_rl.plants.serial.tracking import LATENCY_SAMPLES
 from cartpole_rl.plants.settings import SerialSettings
 from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, TaskSettings
 from cartpole_rl.wire.messages import ClearFault, Fault, Message, SetMotor, Stop
 
 LONG = 100_000  # periods
+HEADER = 4  # bytes before a message in a pipe
 
 
-def scripted_env(port: str, confirm: Confirm) -> CartPoleEnv:
+def scripted_env(port: str, confirm: Confirm, time_limit: int = LONG) -> CartPoleEnv:
     """Made in the driving process."""
     plant = SerialPlant(SerialSettings(port=port), confirm=confirm)
-    task = choice("task/swingup") | {"x_max": 0.38, "time_limit": LONG}
+    plant.statistics.latency.extend([0.0] * LATENCY_SAMPLES)  # of a long run
+    task = choice("task/swingup") | {"x_max": 0.38, "time_limit": time_limit}
     return make_env(
         plant,
         ActionSettings(**choice("actions/two")),
@@ -70,8 +76,8 @@ def peer() -> Iterator[Faulty]:
         yield peer
 
 
-def driver(peer: CartPeer, confirm: Confirm) -> Driver:
-    return Driver(partial(scripted_env, peer.port), network, False, confirm)
+def driver(peer: CartPeer, confirm: Confirm, time_limit: int = LONG) -> Driver:
+    return Driver(partial(scripted_env, peer.port, time_limit=time_limit), network, False, confirm)
 
 
 def test_a_person_who_declines_is_an_error(peer: Faulty, capfd: pytest.CaptureFixture[str]) -> None:
@@ -109,3 +115,19 @@ def test_a_hangup_and_ctrl_c_stop_the_motor(
     assert "Traceback" not in capfd.readouterr().err
     assert [type(frame.message) for frame in peer.received[-2:]] == [SetMotor, Stop]
     assert peer.state.motor_applied == 0
+
+
+def unread(driving: Driver) -> int:
+    """Bytes that have arrived."""
+    waiting: bytes = fcntl.ioctl(driving._ours.fileno(), termios.FIONREAD, bytes(4))
+    return int.from_bytes(waiting, sys.byteorder)
+
+
+def test_a_process_that_is_killed_while_it_sends_an_episode_has_died() -> None:
+    """A pipe does not take a whole episode at once, and this process may read it much later."""
+    with CartPeer() as peer, driver(peer, lambda text: False, time_limit=2) as driving:
+        driving.start(EpisodeRequest(as_weights(network()), 0.0, 0))
+        wait_for(lambda: unread(driving) > HEADER)
+        os.kill(driving.pid, signal.SIGKILL)
+        with pytest.raises(LinkError, match="has died"):
+            driving.result()

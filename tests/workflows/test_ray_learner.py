@@ -3,6 +3,7 @@
 The process of the link and the learner are made up; tests/commands/test_finetune_with_ray.py has a cluster.
 """
 
+import os
 import socket
 import time
 from collections.abc import Callable
@@ -33,6 +34,7 @@ from cartpole_rl.workflows.ray_link import LearnerLink, check_address, check_ver
 
 TRAINING = load_settings(TrainConfig, {"agent.hidden": [8, 8]})
 SETTINGS = RayLearnerSettings(kind="ray", address="server:6379", episodes_ahead=2, timeout=10.0)
+CUT = b"\x00\x00\x00\x64x"  # the beginning of a message of 100 bytes in a pipe
 CONFIG = {"run": "somewhere", "learner": SETTINGS.model_dump(), "episodes": 4, "evaluation_episodes": 1}
 
 
@@ -270,12 +272,15 @@ def test_a_link_that_waits_for_the_end_of_an_episode_is_not_lost(link: PipedLink
         (ConnectionError("no Ray cluster"), "no Ray cluster"),
         (LearnerError("other versions"), "other versions"),  # another learner may take its place
         (None, "its process on this machine ended"),
+        (CUT, "its process on this machine ended"),
     ],
 )
 def test_the_reason_of_a_process_that_ends_is_shown_and_it_is_started_again(
     last: object, reason: str, link: PipedLink, shown: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if last is not None:
+    if isinstance(last, bytes):
+        os.write(link.ends[0].fileno(), last)
+    elif last is not None:
         link.send(last)
     link.ends[0].close()
     for _ in range(3):
