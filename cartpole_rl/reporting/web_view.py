@@ -21,7 +21,7 @@ import threading
 from collections.abc import Iterable
 from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from multiprocessing.connection import Connection
+from multiprocessing.queues import Queue
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -76,13 +76,13 @@ class WebView:
         self._secret = secrets.token_urlsafe(24)
         context = multiprocessing.get_context("spawn")
         self._stopped = context.RawValue("b", 0)
-        receiver, self._sender = context.Pipe(duplex=False)
+        self._added = context.Queue()  # which a thread sends: a page that hangs holds up nothing
         shown = page(title, pole_length, self.memory is None, grows)
         ignored = signal.getsignal(signal.SIGINT) == signal.SIG_IGN  # as a shell's & leaves it
         answer = STOPPED if self.memory else TRAINING_STOPPED if grows else CLOSED
         stop = Stop(os.getpid(), signal.SIGTERM if ignored else signal.SIGINT, self._stopped, answer)
         site = Site(self._secret, shown, [*map(json.dumps, episodes or ())], self.memory, stop)
-        arguments = self._listener, site, receiver
+        arguments = self._listener, site, self._added
         self._process = context.Process(target=serve, args=arguments, daemon=True)
 
     @property
@@ -98,14 +98,14 @@ class WebView:
     def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         self._process.kill()  # it has nothing to save, and may be suspended
         self._process.join()
+        self._added.cancel_join_thread()
         self._listener.close()
         if error is not None and self._stopped.value:
             error.add_note(NOTE)
 
     def add(self, episode: dict[str, Any]) -> None:
-        """Show one more episode; do nothing if the page's process has ended."""
-        with suppress(OSError):
-            self._sender.send(episode)
+        """Show one more episode, unless the page's process has ended."""
+        self._added.put(episode)
 
     def wait(self) -> None:
         """Return once the button of the page is pressed, or Ctrl-C."""
@@ -158,16 +158,15 @@ class Site(NamedTuple):
         return json.dumps({"number": number, "snapshot": shown})
 
 
-def serve(listener: socket.socket, site: Site, added: Connection) -> None:
+def serve(listener: socket.socket, site: Site, added: "Queue[dict[str, Any]]") -> None:
     """Answer requests until the process is ended or its parent ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
     end_with_parent(site.stop.process)
     lose_precedence(LESS_URGENT)
 
     def receive() -> None:
-        with suppress(EOFError, OSError):
-            while True:
-                site.recording.append(json.dumps(added.recv()))
+        while True:
+            site.recording.append(json.dumps(added.get()))
 
     threading.Thread(target=receive, daemon=True).start()
     Server(listener, site).serve_forever()

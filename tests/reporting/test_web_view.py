@@ -106,8 +106,10 @@ def test_it_answers_its_own_computer_alone() -> None:
 
 
 def test_a_page_whose_process_is_suspended_holds_up_nothing() -> None:
-    with WebView("cart", 0.36) as view:
+    long = EPISODE | {"time": [0.0] * 100_000}  # more than a pipe takes
+    with WebView("training", 0.36, [], grows=True) as view:
         os.kill(view._process.pid, signal.SIGSTOP)
+        view.add(long)
     assert not view._process.is_alive()
 
 
