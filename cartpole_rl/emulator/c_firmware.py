@@ -42,7 +42,7 @@ RIG = {  # macros of cart_rig.h: attributes of Hardware, those in m as um, and c
     "CART_POLE_LEVER_UM": ("", "um: m_p l / (m_c + m_p) of the pole, for the brake"),
 }
 LONGEST_ANSWER = 70  # bytes: 2 * CART_FRAME_BYTES
-SNAPSHOT_NUMBERS = 98
+SNAPSHOT_NUMBERS = 99
 
 
 class CartHead(ctypes.Structure):

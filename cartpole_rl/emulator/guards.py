@@ -13,9 +13,9 @@ harder than the motor can hold it, by up to `lever` to each side of the common c
 that centre counts here if it is higher than the cart's. `shake` is twice the lever for a pole that turns 1.6
 times a second or faster.
 
-The brake acts while the cart is armed and after that until it has come to rest: a cart that STOP, the
-watchdog or a fault leaves at speed would roll into an end stop. It never pushes a cart that stands or moves
-inward.
+The brake acts while the cart is armed and after that until it has stood for half a second: a cart that STOP,
+the watchdog or a fault leaves at speed would roll into an end stop, and a swinging pole moves one that stands
+for a moment. It never pushes a cart that stands or moves inward.
 
 A frozen encoder shows a cart that stands; one with an open wire, one whose count changes to and fro by one.
 While the count changes by no more, the cart's motion is estimated from its last speed and, while the pole
@@ -173,6 +173,7 @@ FASTEST = 10_000_000  # um/s; a higher speed counts as this one
 FAST_POLE = 16  # tenths of a turn a second; a higher speed shakes the cart no further
 LEVER = 27_206  # um, of the medium pole on ip02: m_p l / (m_c + m_p)
 LONGEST_ROLLING_US = 3_000_000  # after the cart was armed
+RESTED_US = 500_000  # without motion, after which it rests
 SLOW_POLE = 6  # tenths of a turn a second; a faster pole may hold the cart against its motor
 PUSHED = 5_000_000  # um/s^2: a hard push speeds a common cart up so hard
 SLOWED_US = 100_000  # time constant of the estimated speed without a hard push
@@ -216,6 +217,7 @@ class TrackLimits:
         self._carts: deque[int] = deque(maxlen=samples)
         self._poles: deque[int] = deque(maxlen=samples)
         self._until_us = 0  # the brake acts until then
+        self._moved_us = 0  # the cart was armed or moved then
         self._blind_us = 0  # the brake of a lost cart acts until then
         self._count: int | None = None  # of the cart, since which its motion is estimated
         self._looked_us = 0
@@ -285,7 +287,9 @@ class TrackLimits:
         speed = self._cart_speed()
         if armed:
             self._until_us = now_us + LONGEST_ROLLING_US
-        elif abs(speed) < REST:
+        if armed or abs(speed) >= REST:
+            self._moved_us = now_us
+        elif now_us >= self._moved_us + RESTED_US:
             self._until_us = 0
         self.blocked = 0
         if armed and abs(outward) >= half_span - self.soft:

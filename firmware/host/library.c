@@ -109,6 +109,7 @@ static void add_limits(list *all, const cart *self)
     add(all, limits->blocked);
     add(all, limits->brake);
     add(all, (int64_t)limits->until_us);
+    add(all, (int64_t)limits->moved_us);
     add(all, (int64_t)limits->blind_us);
     add(all, (int64_t)limits->looked_us);
     add(all, limits->counted);

@@ -4,7 +4,7 @@
 
 #include "cart.h"
 
-#define CART_SNAPSHOT_NUMBERS 98
+#define CART_SNAPSHOT_NUMBERS 99
 
 /* The size in bytes of the memory of the policy with which the library was compiled; 0 without one. */
 size_t cart_policy_size(void);

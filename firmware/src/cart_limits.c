@@ -15,6 +15,7 @@
 #define PI 3.14159265358979323846
 #define POLE_RADIANS (2 * PI / CART_POLE_COUNTS) /* a count */
 #define LONGEST_ROLLING_US 3000000u /* after the cart was armed */
+#define RESTED_US 500000u /* without motion, after which it rests */
 #define SLOW_POLE (CART_POLE_COUNTS * 6LL / 10) /* counts/s; a faster pole may hold the cart against its motor */
 #define PUSHED 5000000LL /* um/s^2: a hard push speeds a common cart up so hard */
 #define SLOWED_US 100000 /* time constant of the estimated speed without a hard push */
@@ -166,7 +167,9 @@ void cart_limits_apply(cart_limits *limits, uint64_t now_us, const cart_place *p
     int64_t away = place->outward < 0 ? -place->outward : place->outward;
     if (place->armed)
         limits->until_us = now_us + LONGEST_ROLLING_US;
-    else if (speed < REST && speed > -REST)
+    if (place->armed || speed >= REST || speed <= -REST)
+        limits->moved_us = now_us;
+    else if (now_us >= limits->moved_us + RESTED_US)
         limits->until_us = 0;
     limits->blocked = 0;
     if (place->armed && away >= (int64_t)place->half_span - CART_SOFT_COUNTS)

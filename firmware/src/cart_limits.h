@@ -11,8 +11,9 @@
 
    Towards an end whose switch is pressed, the cart counts as being at that end or beyond.
 
-   The brake acts while the cart is armed and after that until it has come to rest: a cart that STOP, the watchdog
-   or a fault leaves at speed would roll into an end stop. It never pushes a cart that stands or moves inward.
+   The brake acts while the cart is armed and after that until it has stood for half a second: a cart that STOP, the
+   watchdog or a fault leaves at speed would roll into an end stop, and a swinging pole moves one that stands for a
+   moment. It never pushes a cart that stands or moves inward.
 
    A frozen encoder shows a cart that stands; one with an open wire, one whose count changes to and fro by one. While
    the count changes by no more, the cart's motion is estimated from its last speed and, while the pole is slow, from
@@ -40,6 +41,7 @@ typedef struct {
     uint64_t us[CART_SPEED_SAMPLES];
     int32_t carts[CART_SPEED_SAMPLES], poles[CART_SPEED_SAMPLES];
     uint64_t until_us; /* the brake acts until then */
+    uint64_t moved_us; /* the cart was armed or moved then */
     uint64_t blind_us; /* the brake of a lost cart acts until then */
     bool counted;      /* `count` is a count */
     int32_t count;     /* of the cart, since which its motion is estimated */

@@ -58,6 +58,7 @@ def limits(firmware: Any) -> list[int]:
         limits.blocked,
         limits.brake,
         limits._until_us,
+        limits._moved_us,
         limits._blind_us,
         limits._looked_us,
         limits._count is not None,

@@ -87,6 +87,20 @@ def test_no_host_drives_the_cart_against_a_stop(host, cart, period_us):
     assert fastest > 0.5  # the limits leave it room to drive
 
 
+def test_a_cart_that_is_left_under_a_swinging_pole_is_braked_until_it_rests():
+    """The pole turns it round several times: a cart that stands for a moment does not rest."""
+    driven, touched = ready(**LARGE)
+    motors = to_and_fro(driven)
+    for stop in range(6):
+        driven.cart.physics.place_pole(driven.angle, 9.0)
+        for _ in range(20 + 10 * stop):
+            driven.ask(SetMotor(next(motors)))
+        driven.ask(Stop())
+        driven.tick_until(driven.cart.now_us + 4e6)
+        driven.ask(Start())
+    assert max(touched, default=0.0) <= 0.1
+
+
 @pytest.mark.parametrize("after", [0.1, 0.4])
 @pytest.mark.parametrize("cart", [LARGE, SLIPPERY], ids=["large", "slippery"])
 @pytest.mark.parametrize("host", [outward, to_and_fro])
