@@ -201,6 +201,8 @@ def read_file(group: str, path: Path) -> dict[str, Any]:
     """
     if not path.is_file():
         what = "it is a folder; give a file" if path.is_dir() else "there is no such file"
+        if (other := path.with_suffix(".yaml")) != path and other.is_file():
+            what += f"; did you mean {other}?"
         raise ConfigError(f"{group}={path}: {what}")
     try:
         values = yaml.load(path.read_text(encoding="utf-8-sig"), _Loader)

@@ -606,7 +606,7 @@ def _unknown_setting(setting: str, command: str, words: Sequence[str]) -> str:
     group, groups = setting.partition(".")[0], default_choices(command)
     if setting.startswith("layout.keep."):  # takes the name of any column
         return f"{setting}: a new column needs a plus: '+{setting}=[low,high]'"
-    if group not in groups and (conf_folder() / group).is_dir():
+    if group not in groups and group != "hydra" and (conf_folder() / group).is_dir():
         return f"{setting}: cartpole-{command.replace('_', '-')} does not read this group"
     if group in groups and group not in WHOLE:
         if groups[group] is None and group not in map(key_of, words):

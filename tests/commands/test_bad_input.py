@@ -307,3 +307,17 @@ def test_an_interrupt_is_reported_in_one_line(interrupted: tuple[Path, Outcome])
     assert last.endswith(" continues it")
     assert "Traceback" not in done.err
     assert done.out == ""
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        ("pole=mine.yml", "pole=mine.yml: there is no such file; did you mean mine.yaml?"),
+        ("hydra.run.dirr=a", "hydra.run.dirr: there is no such setting; --cfg job shows the settings"),
+    ],
+)
+def test_a_wrong_file_or_name_is_told_nothing_wrong(words: str, complaint: str, tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text(
+        "choices: {mine: {pole_mass: 0.1, pole_com: 0.2, pole_inertia: 1e-3}}"
+    )
+    assert in_process("train", words, folder=tmp_path).complaint == f"cartpole-train: {complaint}"
