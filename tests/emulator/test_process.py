@@ -238,7 +238,7 @@ def refusal(*command: str) -> tuple[int, str]:
 def test_wrong_settings_are_reported_in_one_line():
     status, message = refusal("-m", "cartpole_rl.emulator", '{"cart_mass": -1, "colour": "red"}')
     assert status == 2
-    assert "cart_mass: Input should be greater than 0" in message
+    assert "cart_mass: Input should be greater than or equal to 0.000001" in message
     with pytest.raises(ConfigError, match=r"^emulator settings: settings: Invalid JSON"):
         read_settings("cart_mass=1")
 
