@@ -182,6 +182,8 @@ def find_agent(run: Path) -> Path:
         raise CheckpointError(
             f"run={run}: there is no such file or folder; give a run folder or a checkpoint"
         )
+    if run.suffix == ".py":
+        raise CheckpointError(f"run={run}: a policy of your own is given as run={run.stem}:<its name>")
     if run.is_file():
         return run
     path = run / CHECKPOINTS / LAST

@@ -177,3 +177,9 @@ def test_a_file_of_the_name_of_a_pretrained_agent_comes_first(
     mine.parent.mkdir(parents=True)
     mine.touch()
     assert find_agent(Path("pretrained/medium")) == mine
+
+
+def test_a_file_of_python_is_told_how_a_policy_is_given(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").touch()
+    with pytest.raises(CheckpointError, match="given as run=mine:<its name>"):
+        find_agent(tmp_path / "mine.py")
