@@ -6,14 +6,14 @@
 A page marks a generated block with `<!-- claims: NAME -->`; the block ends at the next blank line.
 
 Texts and statements name values of agents as study/arm/evaluation; within a row the study may be left out.
-`a+b` in place of an arm pools the agents of two arms. In place of an evaluation, `a:b` is the ratio of two
-evaluations of each agent, `ratio` that of the second to the first, `a&b` the lower and `a,b` the mean of
-several; names with @ are numbers of an agent's curves (CURVES), `a#key` is a number of metrics.json or
-identification.json that `report.py --data` stores (reading.BEHAVIOUR). In a text `{iqm arm/evaluation}` is
-replaced by that number, `{iqm arm/evaluation []}` by it with its 95 % interval, `{claim}` by the statistics
-of the row's statements with theirs. `{seeds NAME}` is replaced by the number of seeds, a cell's border, and
-their minimum, median and maximum. The benches' files in docs/results/data give further names: see
-`bench_values`.
+`a+b` in place of an arm pools the agents of two arms, `a|b` those of two names. In place of an evaluation,
+`a:b` is the ratio of two evaluations of each agent, `ratio` that of the second to the first, `a&b` the
+lower and `a,b` the mean of several; names with @ are numbers of an agent's curves (CURVES), `a#key` is a
+number of metrics.json or identification.json that `report.py --data` stores (reading.BEHAVIOUR). In a text
+`{iqm arm/evaluation}` is replaced by that number, `{iqm arm/evaluation []}` by it with its 95 % interval,
+`{claim}` by the statistics of the row's statements with theirs. `{seeds NAME}` is replaced by the number of
+seeds, a cell's border, and their minimum, median and maximum. The benches' files in docs/results/data give
+further names: see `bench_values`.
 
 A statement is a statistic (STATISTICS) with its values, an operator and a number, as
 `difference position/emulated constant/emulated > 0`.
@@ -218,6 +218,8 @@ class Evidence:
         """Return the values of "study/arm/evaluation" or "arm/evaluation" [agents]. Raises ConfigError."""
         if name in self.benches:
             return self.benches[name]
+        if "|" in name:
+            return np.concatenate([self.values(each, study) for each in name.split("|")])
         *above, arms, evaluation = name.split("/")
         study = above[0] if above else study
         try:
