@@ -151,8 +151,12 @@ def outcome(process: "subprocess.Popen[str]", timeout: float = 1000) -> Outcome:
 
 
 def prints_only_progress(done: Outcome, trainings: int = 1) -> bool:
-    """True where trainings printed progress, their track guard and three lines, and nothing of a library."""
+    """True where trainings printed progress, their track guard and three lines, and nothing of a library.
+
+    A sweep also names its jobs, and prints two lines at its end.
+    """
     lines = done.err.replace("\r", "\n").splitlines()
-    expected = " M transitions, score ", "cartpole-train: track guard: "
+    sweep = trainings > 1
+    expected = " M transitions, score ", "cartpole-train: track guard: ", *["cartpole-train: job "] * sweep
     progress = all(any(words in line for words in expected) for line in lines if line.strip())
-    return progress and len(done.out.splitlines()) == 3 * trainings
+    return progress and len(done.out.splitlines()) == 3 * trainings + 2 * sweep
