@@ -9,11 +9,11 @@ Texts and statements name values of agents as study/arm/evaluation; within a row
 `a+b` in place of an arm pools the agents of two arms, `a|b` those of two names. In place of an evaluation,
 `a:b` is the ratio of two evaluations of each agent, `ratio` that of the second to the first, `a&b` the
 lower and `a,b` the mean of several; names with @ are numbers of an agent's curves (CURVES), `a#key` is a
-number of metrics.json or identification.json that `report.py --data` stores (reading.BEHAVIOUR). In a text
-`{iqm arm/evaluation}` is replaced by that number, `{iqm arm/evaluation []}` by it with its 95 % interval,
-`{claim}` by the statistics of the row's statements with theirs. `{seeds NAME}` is replaced by the number of
-seeds, a cell's border, and their minimum, median and maximum. The benches' files in docs/results/data give
-further names: see `bench_values`.
+number of metrics.json or identification.json that `report.py --data` stores (reading.BEHAVIOUR), of the
+agents that have it. In a text `{iqm arm/evaluation}` is replaced by that number, `{iqm arm/evaluation []}`
+by it with its 95 % interval, `{claim}` by the statistics of the row's statements with theirs. `{seeds
+NAME}` is replaced by the number of seeds, a cell's border, and their minimum, median and maximum. The
+benches' files in docs/results/data give further names: see `bench_values`.
 
 A statement is a statistic (STATISTICS) with its values, an operator and a number, as
 `difference position/emulated constant/emulated > 0`.
@@ -290,7 +290,8 @@ def _of_agents(results: StudyResults, arm: str, evaluation: str) -> Array:
         return np.array([function(agent.curves[name]) for agent in agents])
     if "#" in evaluation:
         evaluation, key = evaluation.split("#")
-        return np.array([agent.behaviour[evaluation][key] for agent in agents])
+        found = [agent.behaviour[evaluation].get(key) for agent in agents]
+        return np.array([value for value in found if value is not None])
     if evaluation == "ratio":
         return results.ratios(arm)
     if ":" in evaluation:

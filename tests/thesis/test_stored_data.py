@@ -30,7 +30,7 @@ def test_the_data_are_complete_and_have_a_finding(results: StudyResults) -> None
 def test_set_ups_have_ten_agents() -> None:
     counts = {each.name: {len(each.members(arm.name)) for arm in each.groups} for each in RESULTS}
     few = {name: min(count) for name, count in counts.items() if count != {10}}  # as their rows say
-    three = ("balance_poles", "classical_reward", "fine_tuning_cart_alone", "lengths_on_cart")
+    three = ("balance_poles", "classical_reward", "falls", "fine_tuning_cart_alone", "lengths_on_cart")
     others = {"integrators": 2, "one_cart": 4, "bearing_and_drag": 6, "nine_levels": 5}
     assert few == others | dict.fromkeys(three, 3)
 
