@@ -86,13 +86,17 @@ def last_speed(journal: Path) -> float:
 def test_it_is_driven_and_left_standing(tmp_path: Path) -> None:
     with driven_board(tmp_path / "journal") as plant:
         assert plant.reset_one().counts == (0, 2048)
+        speed = place = 0.0
         for _ in range(30):
-            frame = plant.step_one(60)
+            frame = plant.step_one(60)  # 2.8 m/s^2 and damping, unless this computer is late
+            (dt,) = frame.dt
+            speed += (12 * plant.drove(60) / 255 - 2 * speed) * dt
+            place += speed * dt
         cart, pole = frame.counts
-        assert cart * 25e-6 == pytest.approx(0.10, abs=0.03)  # 2.8 m/s^2 for 0.3 s, with damping
+        assert cart * 25e-6 == pytest.approx(place, abs=0.03)
         assert pole > 2048  # its tip stays behind
         assert not frame.ends
-        assert frame.dt == pytest.approx((0.01,), abs=1e-4)
+        assert dt == pytest.approx(0.01 * round(dt / 0.01), abs=1e-4)
         plant.close()
         lines = taken(tmp_path / "journal")
         assert any(line == "a=2.824" for _, line, _ in lines)
