@@ -131,6 +131,15 @@ def upright_at_end(time: Array, theta: Array) -> bool:
     return bool(time[-1] - time[0] >= HOLD and is_upright(theta[last]).all())
 
 
+def standing(time: Array, theta: Array) -> list[tuple[int, int]]:
+    """Return the first and the last index of each stretch in which the pole is upright for a second (`HOLD`).
+
+    `time` [T] in s, ascending; `theta` [T] in rad.
+    """
+    edges = np.flatnonzero(np.diff(np.pad(is_upright(theta).astype(int), 1))).reshape(-1, 2)
+    return [(first, end - 1) for first, end in edges.tolist() if time[end - 1] - time[first] >= HOLD]
+
+
 class Fall(NamedTuple):
     """A fall below the horizontal of a pole that had stood for a second (`HOLD`)."""
 
@@ -144,8 +153,7 @@ def falls(time: Array, theta: Array) -> list[Fall]:
 
     An episode may end with an angle that is not finite.
     """
-    edges = np.flatnonzero(np.diff(np.pad(is_upright(theta).astype(int), 1))).reshape(-1, 2)
-    stood = [(first, end - 1) for first, end in edges if time[end - 1] - time[first] >= HOLD]
+    stood = standing(time, theta)
     turns = np.floor((np.unwrap(theta) + math.pi) / (2 * math.pi))  # changes by 1 at the hanging position
     found = []
     for (_, last), (first, _) in pairwise([*stood, (len(time), len(time))]):
@@ -161,12 +169,4 @@ def upright_since(time: Array, theta: Array) -> float | None:
 
     `time` [T] in s, ascending; `theta` [T] in rad.
     """
-    start: float | None = None
-    for moment, upright in zip(time, is_upright(theta), strict=True):
-        if not upright:
-            start = None
-        elif start is None:
-            start = float(moment)
-        elif moment - start >= HOLD:
-            return start
-    return None
+    return next((float(time[first]) for first, _ in standing(time, theta)), None)
