@@ -35,8 +35,9 @@ def episode_metrics(episode: Episode, track_half_length: float) -> dict[str, Any
     within 5 degrees for the last second of a full-length episode; `min_track_margin_m` the smallest distance
     from the track's end, negative beyond it: from its own on a simulated cart, else from `track_half_length`.
     `falls` counts how often a pole that had stood for 1 s fell below the horizontal; `recovered_fraction` is
-    the share of them after which it stood again within 5 s, without those too late for that; `recovery_s` and
-    `recovery_swings` are the mean time and the mean number of swings through the hanging position until then.
+    the share of them after which it stood again within 5 s, without those that time, a fault or the link cut
+    off; `recovery_s` and `recovery_swings` are the mean time and the mean number of swings through the
+    hanging position until then.
     Only an episode that the cart's board drove has `same_as_host_fraction`, the share of the compared periods
     with the motor value that this computer would have sent, and `not_compared_steps`, the number of the other
     periods.
@@ -69,7 +70,8 @@ def episode_metrics(episode: Episode, track_half_length: float) -> dict[str, Any
 
 def _recovery(episode: Episode) -> dict[str, Any]:
     every = falls(episode.time, episode.theta)
-    timely = [each for each in every if each.moment + RECOVERY + HOLD <= episode.time[-1]]
+    lost = episode.ended_by in (Ending.TRACK, Ending.ANGLE)  # by the agent: it has not recovered
+    timely = [each for each in every if lost or each.moment + RECOVERY + HOLD <= episode.time[-1]]
     back = [each for each in timely if each.recovery is not None and each.recovery <= RECOVERY]
     return {
         "falls": len(every),

@@ -154,3 +154,9 @@ def test_each_fall_counts_and_recoveries_are_averaged() -> None:
     assert (metrics["falls"], metrics["recovered_fraction"]) == (2, 1)
     assert metrics["recovery_s"] == pytest.approx((4 + 34) / 2 * PERIOD)
     assert metrics["recovery_swings"] == 1
+
+
+def test_a_fall_after_which_the_cart_leaves_the_track_is_no_recovery() -> None:
+    fallen = episode([0.0] * 60 + [180.0] * 20)
+    assert episode_metrics(fallen, 0.4)["recovered_fraction"] is None
+    assert episode_metrics(replace(fallen, ended_by="track"), 0.4)["recovered_fraction"] == 0
