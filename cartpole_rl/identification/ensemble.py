@@ -17,6 +17,7 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from cartpole_rl.errors import LearningError, RecordingError
@@ -111,35 +112,32 @@ class Ensemble:
             if update % self.settings.refresh == 0 or update == self.settings.updates:
                 self.refresh(REFRESHING, update)
                 on_refresh(update, self.history[-1])
-        self.best = self.calibrated()
         return self.best
 
-    def calibrated(self) -> Residual:
-        """Return the best members, so far apart that SHARE of the errors lie within their spread.
+    def calibrate(self, longer: Windows) -> Residual:
+        """Move the best members apart until SHARE of their errors lie within their spread; return them.
 
-        Judged are the windows that each member left out. If motion differs from the members' mean as they
+        Judged are the windows that each member left out, at all times, and the ends of `longer` ones, where
+        errors have grown: the cart's and the angle's each. If motion differs from the members' mean as they
         do from each other, a member differs from it by sqrt(2) spreads, and by the rounding of the encoders.
         Members are never moved nearer.
         """
         near, far = 1.0, WIDEST
         adds = self.best.places.any() or self.best.last.any()
-        if not adds or self.settings.members == 1 or self.covered(near) >= SHARE:
-            return self.best
-        for _ in range(HALVINGS):
-            middle = (near + far) / 2
-            near, far = (near, middle) if self.covered(middle) >= SHARE else (middle, far)
-        return self.best._replace(widening=torch.tensor(far, dtype=torch.float64))
+        if adds and self.settings.members > 1 and self.covered(near, longer) < SHARE:
+            for _ in range(HALVINGS):
+                middle = (near + far) / 2
+                near, far = (near, middle) if self.covered(middle, longer) >= SHARE else (middle, far)
+            self.best = self.best._replace(widening=torch.tensor(far, dtype=torch.float64))
+        return self.best
 
-    def covered(self, widening: float) -> float:
-        """Return the share of the members' errors within CERTAIN spreads."""
+    def covered(self, widening: float, longer: Windows) -> float:
+        """Return the least share of the members' errors within CERTAIN spreads, of those judged."""
         residual = self.best._replace(widening=torch.tensor(widening, dtype=torch.float64))
-        _, errors = predicted_by_members(self.windows, self.dynamics, residual)
-        errors = errors[1:]  # [H, 2, M, W]
-        spread = errors.std(2, ddof=1, keepdims=True)
-        rounding = finest_scale(self.windows.resolution).numpy().reshape(1, 2, 1, 1)
-        judged = np.broadcast_to(self.left_out.numpy(), errors.shape)
-        certain = CERTAIN * np.sqrt(2 * spread**2 + rounding**2)
-        return float((np.abs(errors) <= certain)[judged].mean())
+        within = within_spreads(self.windows, self.dynamics, residual)
+        left_out = within[np.broadcast_to(self.left_out.numpy(), within.shape)].mean()
+        cart, angle = within_spreads(longer, self.dynamics, residual)[-1].mean((1, 2))
+        return float(min(left_out, cart, angle))
 
     def refresh(self, rounds: int, update: int) -> None:
         """Match the initial states again, and keep each member that beats its best loss so far.
@@ -189,6 +187,15 @@ class Ensemble:
         angle = torch.pi * inputs[2]
         inputs[2], inputs[3] = torch.sin(angle), torch.cos(angle)
         return inputs.unsqueeze(0)
+
+
+def within_spreads(windows: Windows, dynamics: Dynamics, residual: Residual) -> NDArray[np.bool_]:
+    """Return where each member's errors [H, 2, M, W] after the lead lie within CERTAIN spreads."""
+    _, errors = predicted_by_members(windows, dynamics, residual)
+    errors = errors[1:]
+    spread = errors.std(2, ddof=1, keepdims=True)
+    rounding = finest_scale(windows.resolution).numpy().reshape(1, 2, 1, 1)
+    return np.asarray(np.abs(errors) <= CERTAIN * np.sqrt(2 * spread**2 + rounding**2))
 
 
 def check_finite(numbers: Tensor) -> None:

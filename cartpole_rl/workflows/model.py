@@ -23,9 +23,9 @@ from cartpole_rl.identification.checks import (
 from cartpole_rl.identification.ensemble import Ensemble
 from cartpole_rl.identification.fit import Fit, best_fit
 from cartpole_rl.identification.identify import HORIZON
-from cartpole_rl.identification.prediction import CERTAIN, REPORTED, errors_at, predict
+from cartpole_rl.identification.prediction import CERTAIN, LEAD, REPORTED, errors_at, predict
 from cartpole_rl.identification.rollout import Dynamics
-from cartpole_rl.identification.windows import Windows, cut_windows, held_out_windows, split
+from cartpole_rl.identification.windows import Windows, cut_windows, held_out_windows, lead_periods, split
 from cartpole_rl.physics.friction import CART_FRICTIONS
 from cartpole_rl.physics.models import Models
 from cartpole_rl.plants.learned import LearnedModel, save_model
@@ -119,6 +119,9 @@ def next_command(model: LearnedModel, pole: str, folder: Path) -> str:
 def learn(episodes: Sequence[Episode], dynamics: Dynamics, fit: Fit, config: ModelConfig) -> Ensemble:
     """Return the ensemble that has learned the residual of the fitted physics."""
     windows = cut_windows(episodes, dynamics.period, most=config.windows)
+    lead = lead_periods(LEAD, dynamics.period)
+    seconds = lead * dynamics.period + max(REPORTED_TIMES)
+    longer = cut_windows(episodes, dynamics.period, seconds, config.windows)._replace(lead=lead)
     ensemble = Ensemble(windows, dynamics, fit.rms, config.ensemble, config.seed, config.hardware.track_span)
     with progress_bar(config.ensemble.updates, "updates") as progress, waiting("learning"):
 
@@ -127,6 +130,8 @@ def learn(episodes: Sequence[Episode], dynamics: Dynamics, fit: Fit, config: Mod
             progress.update(update - progress.n)
 
         ensemble.learn(show_progress)
+    with waiting("calibrating"):
+        ensemble.calibrate(longer)
     return ensemble
 
 
