@@ -31,15 +31,18 @@ Array = NDArray[np.float64]
 class Prediction(NamedTuple):
     """Motion predicted by one model over H periods after the lead, in m and rad; NaN where not measured."""
 
-    simulated: Array  # [H + 1, 2, W] mean of the members, angles not wrapped
-    error: Array  # [H + 1, 2, W] mean of the members: simulated minus measured
-    spread: Array  # [H + 1, 2, W] standard deviation among the members; 0 for physics alone
+    simulated: Array  # [H + 1, 2, W] mean of the members as they were learned, angles not wrapped
+    error: Array  # [H + 1, 2, W] mean of these members: simulated minus measured
+    spread: Array  # [H + 1, 2, W] standard deviation among the members, moved apart; 0 for physics alone
 
 
 def predict(windows: Windows, dynamics: Dynamics, residual: Residual | None = None) -> Prediction:
     """Predict every window after its lead, with each member of `residual`."""
-    simulated, error = predicted_by_members(windows, dynamics, residual)
-    spread = error.std(2, ddof=1) if error.shape[2] > 1 else np.zeros_like(error[:, :, 0])
+    simulated, error = predicted_by_members(windows, dynamics, residual and residual.not_widened())
+    apart = error
+    if residual is not None and residual.widening != 1:
+        _, apart = predicted_by_members(windows, dynamics, residual)
+    spread = apart.std(2, ddof=1) if apart.shape[2] > 1 else np.zeros_like(apart[:, :, 0])
     return Prediction(simulated.mean(2), error.mean(2), spread)
 
 

@@ -92,6 +92,10 @@ class Residual(NamedTuple):
         """Return the tables, [M, PLACES], moved away from their mean."""
         return torch.lerp(self.places.mean(0, keepdim=True), self.places, self.widening)
 
+    def not_widened(self) -> Self:
+        """Return the members as they were learned."""
+        return self._replace(widening=torch.ones_like(self.widening))
+
     def as_type(self, dtype: torch.dtype) -> Self:
         """Return the same numbers in another type."""
         return type(self)(*(weight.to(dtype) for weight in self))
