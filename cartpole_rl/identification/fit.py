@@ -31,6 +31,7 @@ from cartpole_rl.identification.unknowns import (
     hidden,
     limits,
     parameters_at,
+    sized,
     unknowns_of,
 )
 from cartpole_rl.identification.windows import Windows
@@ -121,6 +122,7 @@ def fit_cart(
     """Return the most probable cart, searched for from several starts.
 
     The names `known`, of UNKNOWNS, keep their nominal values, and so do those that a stepper hides.
+    Where a friction is 0 there, its prior is about that of ip02.
     Motion shows only ratios of forces and masses: unless WEIGHED are known, the prior sets the scale.
     `extra_latency` is that of `rollout`.
     The search is from the cart of `near`, if it is given; `sizes`, m and rad, [2], scale the errors.
@@ -129,6 +131,7 @@ def fit_cart(
     check_laws(models, CartParameters(cart_column(nominal)))
     nominal = completed(nominal)
     unknowns = unknowns_of(models, (*known, *hidden(nominal)))
+    nominal = sized(nominal, unknowns)
     positions, motors = torch.from_numpy(windows.positions), torch.from_numpy(windows.motors)
     guess = first_guess(positions, period)
     low, high = map(torch.from_numpy, limits(unknowns, nominal))

@@ -250,7 +250,7 @@ def warnings(fit: Fit, encoders: Encoders) -> list[str]:
                 "the right pole and cart were given"
             )
         if left > UNINFORMED and abs(point) < 1 and np.isfinite(unknown.prior.unusual):
-            found.append(f"the recordings hardly show {unknown.name}: its prior value is kept")
+            found.append(f"the recordings hardly show {unknown.name}: its value is uncertain")
     texts = f"{1e3 * fit.rms[0]:.2g} mm", f"{np.degrees(fit.rms[1]):.2g} deg"
     for name, rms, size, correlation, text in zip(
         ("cart", "pole"), fit.rms, encoders.resolution, fit.correlation, texts, strict=True

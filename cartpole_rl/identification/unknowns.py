@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from cartpole_rl.choices import choice
 from cartpole_rl.physics.models import Models, unused_parameters
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.rig.parameters import PARAMETERS, Bound, Prior, completed, factor
@@ -49,6 +50,13 @@ def unknowns_of(models: Models, known: Sequence[str] = ()) -> list[Unknown]:
 def hidden(nominal: Mapping[str, float]) -> tuple[str, ...]:
     """Return the unknowns that no motion shows: a stepper moves as it is told, whatever these are."""
     return () if nominal["backdrivability"] else OVERCOME
+
+
+def sized(nominal: Mapping[str, float], unknowns: Sequence[Unknown]) -> dict[str, float]:
+    """Return the nominal numbers; a logarithmic unknown of 0, which no factor changes, has that of ip02."""
+    of_ip02 = choice("cart/ip02")
+    unsized = [each.name for each in unknowns if each.prior.logarithmic and nominal.get(each.name) == 0]
+    return {**nominal, **{name: of_ip02[name] for name in unsized if name in of_ip02}}
 
 
 def bound_of(name: str) -> Bound:

@@ -14,7 +14,7 @@ from cartpole_rl.identification.fit import Fit, fit_cart
 from cartpole_rl.identification.identify import warnings
 from cartpole_rl.identification.prediction import errors_at, predict, root_mean_square
 from cartpole_rl.identification.rollout import Dynamics, rollout
-from cartpole_rl.identification.unknowns import limits, parameters_at, unknowns_of
+from cartpole_rl.identification.unknowns import WEIGHED, limits, parameters_at, unknowns_of
 from cartpole_rl.identification.windows import (
     HELD_OUT_LEAD,
     WINDOW,
@@ -82,6 +82,15 @@ def test_a_fit_finds_another_pole(
     recorded = shaken(make_environment(plant, MOTORS, time_limit=300), hold=1)
     found = fit_cart(cut_windows(recorded, PERIOD, most=16), nominal, STEP, PERIOD).parameters
     assert found["pole_com"] == pytest.approx(large.nominal.pole_com, rel=0.05)
+
+
+def test_a_friction_that_is_0_in_the_file_is_found(
+    episodes: list[Episode], nominal: dict[str, float]
+) -> None:
+    smooth = {**nominal, "cart_viscous": 0.0, "cart_coulomb": 0.0}
+    found = fit_cart(cut_windows(episodes, PERIOD, most=10), smooth, STEP, PERIOD, known=WEIGHED).parameters
+    assert found["cart_viscous"] == pytest.approx(TRUTH["cart_viscous"], rel=0.1)
+    assert found["cart_coulomb"] == pytest.approx(TRUTH["cart_coulomb"], rel=0.1)
 
 
 def test_counts_that_jump_are_no_carts(episodes: list[Episode], nominal: dict[str, float]) -> None:
