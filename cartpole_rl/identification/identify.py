@@ -14,7 +14,7 @@ from cartpole_rl.identification.fit import Fit, fit_cart, within_prior
 from cartpole_rl.identification.prediction import LEAD, Replayed, is_away, predict
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.unknowns import WEIGHED, limits
-from cartpole_rl.identification.windows import Windows, cut_judging, cut_windows, lead_periods
+from cartpole_rl.identification.windows import Windows, cut_judging, cut_windows, lead_periods, naming
 from cartpole_rl.physics.friction import CART_FRICTIONS
 from cartpole_rl.physics.laws import Law
 from cartpole_rl.physics.models import Models
@@ -118,7 +118,10 @@ def identify(
     reported. Raises RecordingError where the recordings are not sufficient, or no cart explains one of them.
     """
     episodes = [*fitted.values()]
-    judging = cut_judging(episodes, period, HORIZON, lead_periods(LEAD, period), MOVING)
+    lead = lead_periods(LEAD, period)
+    judging = cut_judging(episodes, period, HORIZON, lead, MOVING)
+    with naming("the held-out recordings"):  # before the long fit: they have to give an error
+        cut_judging([*held_out.values()], period, HORIZON, lead, 0.0)
 
     def attempt(
         cart_friction: Law,

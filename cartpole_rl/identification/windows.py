@@ -143,7 +143,8 @@ def cut_judging(
     ]
     if not pieces:
         raise RecordingError(
-            f"the cart never moves for {seconds:g} s without a lost frame: drive it more, check the cable"
+            f"the cart never moves for {seconds:g} s without a lost frame: give longer recordings, drive it "
+            "more, or check the cable"
         )
     return joined(pieces[(JUDGING - 1) % len(pieces) :: JUDGING])._replace(lead=lead)
 

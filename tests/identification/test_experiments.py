@@ -499,6 +499,17 @@ def test_the_recording_of_which_the_cart_explains_least_is_named(
         check_explained({"late": late}, found.dynamics, 1.0)
 
 
+def test_held_out_recordings_that_give_no_error_are_refused_before_the_fit(
+    recordings: dict[str, Episode], nominal: dict[str, float]
+) -> None:
+    fitted, held_out = split(recordings)
+    short = {str(first): held_out[HELD_OUT].part(first, first + 45) for first in range(0, 450, 45)}
+    fits: list[None] = []
+    with pytest.raises(RecordingError, match="the held-out recordings: the cart never moves for 1 s"):
+        identify(fitted, short, nominal, MODELS, PERIOD, 4, 40, on_step=lambda: fits.append(None))
+    assert not fits
+
+
 def test_the_held_out_recording_changes_the_reported_error_alone(
     recordings: dict[str, Episode], found: Identification
 ) -> None:
