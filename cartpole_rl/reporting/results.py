@@ -28,6 +28,7 @@ MEASURES = {  # key of metrics.json: label
 LOW_IS_GOOD = (  # starts of measures
     *("errors", "rms_", "time_to_", "network_over_", "guarded_fraction", "motor_reversals_per_s"),
     *("late_ticks", "lost_frames", "bad_frames", "ended_by.", "falls", "recovery_"),
+    *("held_out_1_s.", "residual.", "candidates.", "standard_errors."),  # of an identification
 )
 SCORES = get_args(Measure)
 SCORE_DECIMALS = 1  # at most

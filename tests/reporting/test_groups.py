@@ -29,6 +29,8 @@ def test_trainings_of_other_lengths_are_drawn_over_their_share() -> None:
 def test_of_errors_and_of_endings_before_the_time_less_is_better() -> None:
     names = ("rms_angle_rad", "guarded_fraction", "late_ticks", "ended_by.track", "ended_by.time", "score")
     assert [low_is_good(name) for name in names] == [True] * 4 + [False] * 2
+    of_identification = "held_out_1_s.theta_rad", "residual.x_m", "candidates.step.x_m", "parameters.latency"
+    assert [low_is_good(name) for name in of_identification] == [True] * 3 + [False]
 
 
 def results_of(count: int) -> Results:
