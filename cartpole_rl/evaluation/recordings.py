@@ -97,7 +97,11 @@ def read_recording(path: Path) -> Recording:
     facts, text = read_heading(path)
     if facts.get("format") != FORMAT:
         raise RecordingError(f"{path} is not a recording: its first line is not '# format: {FORMAT}'")
-    return Recording(path.stem, episode_of(path, facts, list(csv.DictReader(text))), facts)
+    try:
+        rows = list(csv.DictReader(text))
+    except csv.Error as error:
+        raise RecordingError(f"{path} is damaged: {error}; leave this recording out") from None
+    return Recording(path.stem, episode_of(path, facts, rows), facts)
 
 
 def episode_of(path: Path, facts: Mapping[str, str], rows: Sequence[Mapping[str, str]]) -> Episode:

@@ -88,16 +88,17 @@ def check_each(recordings: Mapping[str, Episode], period: float) -> None:
 
 
 def shared_period(recordings: Mapping[str, Episode]) -> float:
-    """Return the control period of recordings, s, by the names of their files.
+    """Return the control period of recordings, s, by the names of their files: the median.
 
     Raises RecordingError for the first one of another period.
     """
     gaps = {file: mean_gap(episode.time) for file, episode in recordings.items() if episode.steps}
-    first, period = next(iter(gaps.items()))
+    usual = sorted(gaps, key=lambda file: gaps[file])[(len(gaps) - 1) // 2]
+    period = gaps[usual]
     for file, other in gaps.items():
         if abs(other / period - 1) > SAME_PERIOD:
             raise RecordingError(
-                f"{file} has a frame every {1e3 * other:g} ms, {first} every {1e3 * period:g} ms: give "
+                f"{file} has a frame every {1e3 * other:g} ms, {usual} every {1e3 * period:g} ms: give "
                 "recordings of one control period"
             )
     return period

@@ -89,6 +89,7 @@ def test_any_reader_of_csv_sees_columns_with_units(tmp_path: Path, episode: Epis
         (lambda text: with_cell(text, 6, "x_m", ""), "x_m in row 6 is empty; give a number, or leave"),
         (lambda text: with_cell(text, 7, "pole_counts", "1,5"), "damaged"),
         (lambda text: with_cell(text, 40, "score", "none"), "score in row 40 is 'none'; give a number"),
+        (lambda text: with_cell(text, 2, "x_m", "9" * 140_000), "damaged: field larger than"),
         (lambda text: text[: len(text) // 2], "damaged"),
     ],
 )

@@ -408,6 +408,12 @@ def test_the_period_is_the_mean_gap(read: Read, motion: Columns) -> None:
     assert len(log.parts) == 1
 
 
+def test_the_period_of_recordings_is_not_that_of_the_first(read: Read, motion: Columns) -> None:
+    gaps = {"slower": 0.0203, "one": 0.02, "other": 0.02}
+    parts = {name: read({**motion, "t": gap * np.arange(STEPS)}).parts[0] for name, gap in gaps.items()}
+    assert shared_period(parts) == 0.02
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
