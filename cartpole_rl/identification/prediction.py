@@ -69,6 +69,7 @@ def errors_at(
 ) -> list[dict[str, Any]]:
     """Return RMS and median of the absolute errors at those `times`, s after the lead, that windows reach.
 
+    `after_s` of each is the time of the period that is nearest, to two digits.
     `error` [H + 1, 2, W] is that of a Prediction; with its `spread`, the same of the spread is added, and the
     share of errors within CERTAIN spreads.
     """
@@ -77,7 +78,7 @@ def errors_at(
         row = round(time / period)
         if row >= len(error) or not (known := np.isfinite(error[row]).all(0)).any():
             continue
-        line: dict[str, Any] = {"after_s": time, "windows": int(known.sum())}
+        line: dict[str, Any] = {"after_s": float(f"{row * period:.2g}"), "windows": int(known.sum())}
         for channel, (name, factor) in enumerate(REPORTED.items()):
             size = factor * np.abs(error[row, channel, known])
             line |= _summary(name, size)

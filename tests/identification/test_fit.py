@@ -189,6 +189,7 @@ def test_errors_count_the_windows_that_reach_a_time() -> None:
     early, late = errors_at(ERROR, (0.1, 1.0, 7.0), 0.02)  # none at 7 s
     assert (early["after_s"], early["windows"]) == (0.1, 18)
     assert (late["after_s"], late["windows"]) == (1.0, 16)
+    assert [each["after_s"] for each in errors_at(ERROR, (0.1, 1.0), 0.03)] == [0.09, 0.99]
     for line in (early, late):
         assert line["rms_x_mm"] == pytest.approx(20)
         assert line["median_theta_deg"] == pytest.approx(3)
