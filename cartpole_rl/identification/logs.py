@@ -234,7 +234,8 @@ def signed(positive: Direction) -> int:
 
 def read_columns(path: Path, layout: Layout) -> dict[str, Array]:
     """Return the columns of a log that the layout names. Raises RecordingError."""
-    wanted = [layout.time.name, layout.position.name, layout.angle.name, layout.motor.name, *layout.keep]
+    named = layout.time, layout.position, layout.angle, layout.motor
+    wanted = [*dict.fromkeys((*(each.name for each in named), *layout.keep))]
     if read := ARRAYS.get(path.suffix.lower()):
         return array_columns(path, read, wanted)
     try:
@@ -283,7 +284,7 @@ def heading_and_rows(
 
 def check_columns(path: Path, wanted: Sequence[str], present: Sequence[str]) -> None:
     """Raise RecordingError for a wanted column that is not present, or present twice."""
-    if twice := [name for name in dict.fromkeys(wanted) if list(present).count(name) > 1]:
+    if twice := [name for name in wanted if list(present).count(name) > 1]:
         raise RecordingError(f"{path} has several columns {', '.join(twice)}; give each a name of its own")
     if missing := [name for name in wanted if name not in present]:
         kind = NotALogError if len(missing) == len(wanted) else RecordingError
