@@ -1,6 +1,7 @@
 """The picture of what a randomization draws: a histogram of each parameter."""
 
 import math
+import textwrap
 from itertools import combinations
 
 import numpy as np
@@ -22,7 +23,8 @@ PANEL = 1.75  # inch, height
 BARS = 60
 NOTED = 0.2  # correlation from which a pair is named
 MOST_PAIRS = 4
-ABOUT = "Dashed: the nominal cart. Grey edges: the lowest and the highest value drawn."
+LONGEST_LINE = 100  # characters that are as wide as the figure
+ABOUT = "Dashed: the nominal value; of a posterior, the median. Grey: the lowest and the highest drawn."
 
 
 def drawn_carts(draws: Draws, seed: int) -> Figure:
@@ -59,11 +61,12 @@ def _histogram(axes: Axes, name: str, values: NDArray[np.float64], nominal: floa
 
 
 def correlations(varied: dict[str, NDArray[np.float64]]) -> str:
-    """Return a line with the most correlated pairs of parameters; empty if none is above NOTED."""
+    """Return lines with the most correlated pairs of parameters; empty if none is above NOTED."""
     matrix = np.atleast_2d(np.corrcoef([*varied.values()]))
     pairs = {
         f"{one} and {other} {matrix[first, second]:.2f}": abs(matrix[first, second])
         for (first, one), (second, other) in combinations(enumerate(varied), 2)
     }
     named = [pair for pair in sorted(pairs, key=pairs.__getitem__, reverse=True) if pairs[pair] >= NOTED]
-    return f"\nCorrelation: {', '.join(named[:MOST_PAIRS])}." if named else ""
+    line = f"Correlation: {', '.join(named[:MOST_PAIRS])}."
+    return f"\n{textwrap.fill(line, LONGEST_LINE)}" if named else ""
