@@ -12,6 +12,7 @@ Hypothesis sets no deadlines: no test fails because a machine is slow.
 Torch takes one thread, here and in children: the work of a test is small, and threads would wait busily.
 Python collects garbage seldom: with torch imported, it would take a sixth of the time of a small command.
 Hydra reads each file of conf/ once: reading them would take a third of the time of a composition.
+A track guard is fitted to an eighth of the carts, but with `all_carts`; pictures are coarse.
 """
 
 import gc
@@ -32,7 +33,8 @@ from command_line import no_pictures
 from filelock import FileLock
 from hypothesis import HealthCheck, settings
 
-from cartpole_rl.envs.build import make_env
+from cartpole_rl.envs import guard
+from cartpole_rl.envs.build import known_guard_numbers, make_env
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.settings import ObservationSettings, TrackGuard
 from cartpole_rl.physics.models import Models
@@ -43,6 +45,7 @@ from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.randomization.randomizer import Randomizer
 from cartpole_rl.randomization.ranges import Range
 from cartpole_rl.registry import Registry
+from cartpole_rl.reporting import style
 from cartpole_rl.rig.hardware import parameters_of
 from cartpole_rl.rig.parameters import PARAMETERS, completed
 from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, Start, StartSettings, TaskSettings
@@ -52,6 +55,10 @@ CONF = Path(__file__).parents[1] / "conf"
 os.environ["OMP_NUM_THREADS"] = "1"  # of children
 torch.set_num_threads(1)
 gc.set_threshold(100_000, 50, 100)
+FITTED = {"SAMPLES": guard.SAMPLES, "LEAST_SAMPLES": guard.LEAST_SAMPLES}  # of a track guard
+for name, number in FITTED.items():
+    setattr(guard, name, number // 8)
+style.DPI //= 3
 settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("any machine")
 
@@ -125,6 +132,17 @@ def once(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., tuple[Path, 
         return copy / "run", pickle.loads(ended.read_bytes())
 
     return once
+
+
+@pytest.fixture(scope="module")
+def all_carts() -> Iterator[None]:
+    """Fit track guards to as many carts as a command does."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, number in FITTED.items():
+            patch.setattr(guard, name, number)
+        known_guard_numbers.cache_clear()
+        yield
+    known_guard_numbers.cache_clear()
 
 
 @pytest.fixture

@@ -23,6 +23,7 @@ from cartpole_rl.tasks.episode import Ending
 from cartpole_rl.tasks.features import MOTOR_SCALE
 from cartpole_rl.tasks.settings import NO_ACTION
 
+pytestmark = pytest.mark.usefixtures("all_carts")
 GUARD = TrackGuard(margin=0.01, delay=0.1, deceleration=5.0)
 END = 0.38  # m
 CARTS = 4_000

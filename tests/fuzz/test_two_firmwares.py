@@ -14,7 +14,7 @@ from cartpole_rl.emulator import c_firmware
 from cartpole_rl.rig.hardware import hardware_of
 
 pytestmark = needs_compiler
-SHORT = ("--bytes", "20000", "--frames", "3000")
+SHORT = ("--bytes", "8000", "--frames", "1500")
 OTHER = {
     "cart_nanometres_per_count": 98_175,
     "pole_counts_per_turn": 1001,
@@ -35,7 +35,7 @@ OTHER = {
 
 @pytest.mark.parametrize(
     ("rig", "seed", "counted"),
-    [({}, "3", " 2 POLE_ENCODER,"), (OTHER, "6", " 1 homings,")],
+    [({}, "24", " 1 POLE_ENCODER,"), (OTHER, "63", " 2 homings,")],
     ids=["ip02, with failing encoders", "other, with switches, homed and driven"],
 )
 def test_both_firmwares_agree_under_sanitizers(rig: dict[str, float], seed: str, counted: str) -> None:

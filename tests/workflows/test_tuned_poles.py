@@ -97,6 +97,7 @@ def test_it_is_exported_with_a_track_guard_for_all_poles_that_it_knows(
     assert numbers["large"].delay == of_pole["large"].delay > 1.2 * of_pole["medium"].delay
 
 
+@pytest.mark.usefixtures("all_carts")
 def test_an_agent_of_the_large_pole_that_was_tuned_on_a_shorter_one_keeps_its_guard(
     agent: AgentCheckpoint, tmp_path: Path
 ) -> None:
