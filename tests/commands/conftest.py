@@ -1,4 +1,4 @@
-"""Runs that several test files share: two trainings (one interrupted), an identification, a fine-tuning."""
+"""Runs that several test files share: of training (two, one interrupted), fine-tuning, recording, and models."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 from command_line import (
+    ENSEMBLE,
     FINETUNING,
     IDENTIFICATION,
     TINY,
@@ -76,3 +77,27 @@ def tuned(once: Once, trained: Path) -> tuple[Path, Outcome]:
         return done
 
     return once("tuned", make)
+
+
+@pytest.fixture(scope="session")
+def recorded(once: Once) -> Path:
+    """The run folder of two recorded episodes of the nominal cart."""
+
+    def make(folder: Path) -> None:
+        done = in_process("record", "run=lqr", "episodes=2", "hydra.run.dir=run", folder=folder)
+        assert done.code == 0, done.err
+
+    return once("recorded", make)[0]
+
+
+@pytest.fixture(scope="session")
+def learned(once: Once, recorded: Path) -> tuple[Path, Outcome]:
+    """The run folder and the outcome of a small ensemble, learned from `recorded`; one episode is given twice."""
+    both = ",".join(str(recorded / f"recordings/episode_00{number}.csv") for number in (0, 1, 0))
+
+    def make(folder: Path) -> Outcome:
+        done = in_process("model", f"from=[{both}]", *ENSEMBLE, "hydra.run.dir=run", folder=folder)
+        assert done.code == 0, done.err
+        return done
+
+    return once("learned", make)

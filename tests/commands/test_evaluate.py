@@ -47,10 +47,11 @@ def evaluated(trained: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("evaluated")
     noisy = "parameters={latency:0.01,latency_jitter:0.002,angle_noise:0.002}"
     emulated = ("plant=emulated", "episodes=1", "animation.simulation=true")
-    wide = ("randomization=wide", "pole=both", "task=swingup", "seed=5", "episodes=7")
+    short = ("task=swingup", "task.time_limit=100")
+    wide = ("randomization=wide", "pole=both", *short, "seed=5", "episodes=7")
     with no_pictures():
         evaluate(trained, folder, "wide", *wide)
-        evaluate(trained, folder, "noisy", noisy, "task=swingup", "episodes=3")
+        evaluate(trained, folder, "noisy", noisy, *short, "episodes=3")
     evaluate(trained, folder, "emulated", *emulated)
     for name in ("older", "damaged"):
         shutil.copytree(folder / "wide", folder / name)
@@ -218,7 +219,7 @@ def test_the_first_episode_is_drawn_beside_its_prediction(evaluated: Path) -> No
 
 
 def test_the_prediction_starts_where_the_cart_did_and_drives_the_nominal_cart(trained: Path) -> None:
-    words = {"run": trained, "randomization": "wide", "task": "swingup", "episodes": 1}
+    words = {"run": trained, "randomization": "wide", "task": "swingup", "task.time_limit": 9, "episodes": 1}
     evaluation = prepared(load_settings(EvaluateConfig, words))
     (episode,) = evaluation.episodes()
     simulation = predicting_env(evaluation.settings, evaluation.training.plant, seed=0)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from command_line import ONCE, TINY, Outcome, in_process
+from command_line import ENSEMBLE, ONCE, TINY, Outcome, in_process
 
 from cartpole_rl.envs.build import driven_carts, simulated_env, with_fitted_guard
 from cartpole_rl.envs.guard import stopping_distance
@@ -21,35 +21,6 @@ from cartpole_rl.terminal import noting
 from cartpole_rl.workflows.config import TrainConfig, load_settings
 from cartpole_rl.workflows.model import next_command
 from cartpole_rl.workflows.train import print_notes
-
-SMALL = (
-    "windows=20",
-    "ensemble.members=2",
-    "ensemble.hidden=4",
-    "ensemble.updates=4",
-    "ensemble.refresh=2",
-)
-
-
-@pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The run folder of two short recorded episodes of a simulated cart."""
-    folder = tmp_path_factory.mktemp("recorded")
-    shorter = ["task=swingup", "task.time_limit=400"]
-    done = in_process("record", "run=lqr", "episodes=2", *shorter, "hydra.run.dir=run", folder=folder)
-    assert done.code == 0, done.err
-    return folder / "run"
-
-
-@pytest.fixture(scope="module")
-def learned(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Outcome]:
-    """The run folder of a small ensemble, and what was printed."""
-    folder = tmp_path_factory.mktemp("model")
-    both = ",".join(str(recorded / f"recordings/episode_00{number}.csv") for number in (0, 1, 0))
-    done = in_process("model", f"from=[{both}]", *SMALL, "hydra.run.dir=run", folder=folder)
-    assert done.code == 0, done.err
-    return folder / "run", done
-
 
 def frozen(episode: Episode) -> Episode:
     """With a pole that is not counted for two seconds."""
@@ -88,7 +59,7 @@ def test_recordings_that_teach_a_wrong_model_are_refused(
         chosen = everywhere or path.stem == "episode_001"
         write_recording(tmp_path / path.name, change(episode) if chosen else episode)
     for command in ("model", "replay") if change is slower else ("model",):
-        small = SMALL if command == "model" else ()
+        small = ENSEMBLE if command == "model" else ()
         done = in_process(command, f"from={tmp_path}", *small, "hydra.run.dir=run", folder=tmp_path)
         assert done.code == 2
         assert said in done.complaint
@@ -204,6 +175,6 @@ def test_too_short_a_recording_says_so(recorded: Path, tmp_path: Path) -> None:
     lines = (recorded / "recordings/episode_000.csv").read_text().splitlines()
     heading = sum(line.startswith("#") for line in lines)
     (tmp_path / "short.csv").write_text("\n".join([*lines[: heading + 80], lines[-1]]) + "\n")
-    done = in_process("model", "from=short.csv", *SMALL, folder=tmp_path)
+    done = in_process("model", "from=short.csv", *ENSEMBLE, folder=tmp_path)
     assert "the held-out recordings have no 1.44 s without a lost frame: record longer" in done.err
     assert done.code == 2

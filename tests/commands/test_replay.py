@@ -2,24 +2,12 @@
 
 import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 from command_line import Outcome, in_process
-
-
-@pytest.fixture(scope="module")
-def recorded(once: Callable[..., tuple[Path, Any]]) -> Path:
-    """The run folder of two recorded episodes of the nominal cart."""
-
-    def make(folder: Path) -> None:
-        done = in_process("record", "run=lqr", "episodes=2", "hydra.run.dir=run", folder=folder)
-        assert done.code == 0, done.err
-
-    return once("recorded", make)[0]
 
 
 def replay(source: Path, folder: Path, *words: str) -> tuple[Outcome, dict[str, Any]]:

@@ -6,6 +6,8 @@ import signal
 import sys
 import time
 from collections.abc import Iterator
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,6 @@ import yaml
 from command_line import (
     COARSE,
     TINY,
-    console_script,
     in_process,
     interrupt_after,
     no_pictures,
@@ -228,12 +229,14 @@ def test_a_stopped_training_resumes_identically(tmp_path: Path) -> None:
     words = (*TINY, "learning.transitions=4096", "learning.evaluations=8", "buffer=prioritized", "pole=both")
     checkpoint = tmp_path / "stopped/checkpoints/resume.pt"
 
-    killed = console_script("train", *words, "hydra.run.dir=stopped", folder=tmp_path)
+    training = partial(in_process, "train", *words, "hydra.run.dir=stopped", folder=tmp_path)
+    killed = get_context("fork").Process(target=training)
+    killed.start()
     while not checkpoint.exists():
-        assert killed.poll() is None, killed.communicate()
+        assert killed.is_alive()
         time.sleep(0.002)
     killed.kill()
-    killed.communicate()
+    killed.join()
     assert len(history(tmp_path / "stopped")) < 8
 
     interrupt_after(checkpoint, signal.SIGTERM)

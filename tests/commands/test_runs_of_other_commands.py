@@ -3,7 +3,7 @@
 import json
 import math
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -60,31 +60,34 @@ def runs(
     stopped: Path,
     identified: tuple[Path, Outcome],
     tuned: tuple[Path, Outcome],
+    recorded: Path,
+    learned: tuple[Path, Outcome],
     once: Callable[..., tuple[Path, Any]],
 ) -> Path:
     """A folder with a toy run of each command, named after it, and an interrupted training."""
-    return once("runs", lambda folder: make_runs(folder / "run", trained, stopped, identified[0], tuned[0]))[
-        0
-    ]
+    made = {
+        "train": trained,
+        "unfinished": stopped,
+        "identify": identified[0],
+        "finetune": tuned[0],
+        "record": recorded,
+        "model": learned[0],
+    }
+    return once("runs", lambda folder: make_runs(folder / "run", made))[0]
 
 
-def make_runs(folder: Path, trained: Path, stopped: Path, identified: Path, tuned: Path) -> None:
-    """Fill a folder with them."""
-    shutil.copytree(trained, folder / "train")
-    shutil.copytree(stopped, folder / "unfinished")
-    shutil.copytree(identified, folder / "identify")
-    shutil.copytree(tuned, folder / "finetune")
-    model = ("windows=20", "ensemble.members=1", "ensemble.hidden=4", "ensemble.updates=2")
+def make_runs(folder: Path, runs: Mapping[str, Path]) -> None:
+    """Fill a folder with copies of `runs` and those of the other commands."""
+    for name, run in runs.items():
+        shutil.copytree(run, folder / name)
     small = [f"distillation.{name}=2" for name in ("carts", "rounds", "periods", "updates", "batch_size")]
     rows = "".join(f"{row / 50},{math.sin(row / 9) / 9},{row / 9},{row % 2}\n" for row in range(100))
     (folder / "log.csv").write_text(f"time,position,angle,motor\n{rows}")
     made = (
         ("evaluate", "run=train", "episodes=1", "hydra.run.dir=evaluate"),
-        ("record", "run=lqr", "episodes=3", "task=swingup", "task.time_limit=400", "hydra.run.dir=record"),
         ("record", "-m", "run=train", "episodes=1", "seed=0", "hydra.sweep.dir=multirun"),
         ("import", "from=log.csv", "hydra.run.dir=import"),
         ("replay", "from=record", "hydra.run.dir=replay"),
-        ("model", "from=record", *model, "hydra.run.dir=model"),
         ("distill", "run=train", *small, "hydra.run.dir=distill"),
         ("export", "run=train", "format=weights", "hydra.run.dir=export"),
         ("report", "runs=evaluate", "animations=false", "hydra.run.dir=report"),

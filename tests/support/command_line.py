@@ -49,6 +49,13 @@ FINETUNING = (
 TRUTH = ("emulator.cart_viscous=1.1", "emulator.latency=0.012", "emulator.angle_offset=-0.01")
 QUICK = ("windows=40", "substeps=4", "carts=200")
 IDENTIFICATION = (*TRUTH, COARSE, *QUICK)
+ENSEMBLE = (
+    "windows=20",
+    "ensemble.members=2",
+    "ensemble.hidden=4",
+    "ensemble.updates=2",
+    "ensemble.refresh=1",
+)
 DISTILLATION = tuple(
     f"distillation.{name}={value}"
     for name, value in {"carts": 8, "rounds": 2, "periods": 5, "updates": 3, "batch_size": 16}.items()
