@@ -61,7 +61,9 @@ def rollout(
         if now < history:
             _, force = step_forces(*drive, latency, cart, models.actuator, period, substeps)
             continue
-        state, (force, _) = run_period(state, drive, latency, cart, models, period, substeps, addition)
+        state, (force, _) = run_period(
+            state, drive, latency, cart, models, period, substeps, addition, in_effect
+        )
         measured.append(as_measured(state, cart))
     return torch.stack(measured)
 

@@ -177,18 +177,21 @@ def run_period(
     period: float,
     substeps: int,
     addition: MakeAddition | None = None,
+    in_effect: int | None = None,
 ) -> tuple[State, Drive]:
     """Integrate one control period of `period` s in `substeps` equal steps.
 
     `drive.motors` holds this period's motor value first; `latency` [N] s is this period's own draw, for all
     pending commands. If the command in force changes inside a step, the step takes the mean of both
-    forces by their share of time. `addition` acts in every step.
+    forces by their share of time. `addition` acts in every step; it may read more motor values than the
+    newest `in_effect`, which all that `latency` leaves in effect are among.
     """
     step = period / substeps
     body = mechanism(cart)
     added = None if addition is None else addition(state, drive)
-    forces, last = step_forces(*drive, latency, cart, models.actuator, period, substeps)
-    held = [viscous_share(motor, cart) for motor in drive.motors]
+    motors = drive.motors[:in_effect]
+    forces, last = step_forces(drive.force, motors, latency, cart, models.actuator, period, substeps)
+    held = [viscous_share(motor, cart) for motor in motors]
     shares = mean_commands(held, latency, period, substeps)
     for mean, share in zip(forces, shares, strict=True):
         if added is None:

@@ -149,12 +149,13 @@ class LearnedPlant(SimulatedPlant):
         super().__init__(carts, randomizer, start, *physics, seed, device, compiled, hardware)
         # the member that moves each cart, [N]; it changes in place when a row resets
         self.member = torch.zeros(carts, dtype=torch.int64, device=self.device)
-        memory = model.residual.memory
+        memory, under_way = model.residual.memory, len(self._carts.drive) - 1
         if len(self._carts.drive) < 1 + memory:
             missing = self._carts.drive.new_zeros(1 + memory - len(self._carts.drive), carts)
             self._carts = self._carts._replace(drive=torch.cat((self._carts.drive, missing)))
         self._residual = Residual(*(part.to(self.device) for part in model.residual))
-        run: Callable[..., Period] = partial(run_learned_carts, **self._plain_run.keywords)
+        settings = self._plain_run.keywords
+        run: Callable[..., Period] = partial(run_learned_carts, in_effect=under_way, **settings)
         self._run_learned = Compiled(run) if compiled else run
         self._run = self._run_members
 

@@ -75,19 +75,23 @@ def run_carts(
     substeps: int,
     encoders: Encoders,
     addition: MakeAddition | None = None,
+    in_effect: int | None = None,
 ) -> Period:
-    """Run every cart for `period` s in `substeps` steps under a new motor value."""
+    """Run every cart for `period` s in `substeps` steps under a new motor value.
+
+    `addition` and `in_effect` are those of `run_period`.
+    """
     cart = CartParameters(carts.table)
     before = State(*carts.motion.unbind(0))
     force, *motors = carts.drive.unbind(0)
     drive = Drive(force, [inputs.motor[0].to(force.dtype), *motors[:-1]])
     latency = (cart.latency + inputs.noise[0] * cart.latency_jitter).clamp(min=0)
-    state, drive = run_period(before, drive, latency, cart, models, period, substeps, addition)
+    state, drive = run_period(before, drive, latency, cart, models, period, substeps, addition, in_effect)
     return Period(
         torch.stack(state),
         torch.stack((drive.force, *drive.motors)),
         encoder_counts(state, cart, inputs.noise, encoders),
-        motor_in_force(drive.motors, cart.latency, period),
+        motor_in_force(drive.motors[:in_effect], cart.latency, period),
         ~(state.x.abs() <= cart.track_half_length).unsqueeze(0),  # also if it is NaN
     )
 

@@ -53,7 +53,7 @@ ENSEMBLE = (
     "windows=20",
     "ensemble.members=2",
     "ensemble.hidden=4",
-    "ensemble.updates=2",
+    "ensemble.updates=1",
     "ensemble.refresh=1",
 )
 DISTILLATION = tuple(
