@@ -1,4 +1,4 @@
-"""Runs that several test files share: of training (two, one interrupted), fine-tuning, recording, and models."""
+"""Runs that several test files share; two are trainings, of which one was interrupted."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -92,7 +92,7 @@ def recorded(once: Once) -> Path:
 
 @pytest.fixture(scope="session")
 def learned(once: Once, recorded: Path) -> tuple[Path, Outcome]:
-    """The run folder and the outcome of a small ensemble, learned from `recorded`; one episode is given twice."""
+    """The run folder and the outcome of a small ensemble; one of its two recordings is given twice."""
     both = ",".join(str(recorded / f"recordings/episode_00{number}.csv") for number in (0, 1, 0))
 
     def make(folder: Path) -> Outcome:

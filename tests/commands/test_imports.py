@@ -92,7 +92,8 @@ WORK = {  # what only work needs
 }
 SUPPORT = str(Path(__file__).parents[1] / "support")
 RUN_IN_TURN = """
-import contextlib, io, json, sys
+import contextlib, gc, io, json, sys
+gc.disable()
 sys.path.append({support!r})
 import files_read_once
 from hydra.core.global_hydra import GlobalHydra
