@@ -1,9 +1,14 @@
-"""Importing this lets Hydra read each file of conf/ once: a third of the time of a composition is saved."""
+"""Importing this lets Hydra read each file of conf/ and parse each `${...}` once.
+
+More than a third of the time of a composition is saved.
+"""
 
 import pickle
 from functools import cache
 from pathlib import Path
 
+import omegaconf._utils
+import omegaconf.base
 from hydra._internal.core_plugins.file_config_source import FileConfigSource
 from hydra.plugins.config_source import ConfigResult
 
@@ -23,4 +28,5 @@ def read_once(self: FileConfigSource, config_path: str) -> ConfigResult:
     return pickle.loads(shipped_file(self.provider, config_path))
 
 
+omegaconf.base.parse = omegaconf._utils.parse = cache(omegaconf.base.parse)
 read, FileConfigSource.load_config = FileConfigSource.load_config, read_once

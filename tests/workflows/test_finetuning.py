@@ -259,6 +259,7 @@ def recorded() -> list[Episode]:
 def late(recorded: list[Episode]) -> CartLearner:
     """A learner that starts after two episodes, without the state of the earlier one."""
     learner = new_learner()
+    learner.candidates = learner.candidates[:1]
     learner.start(recorded, learned=2)
     return learner
 
