@@ -5,6 +5,7 @@ when the port can be opened. The cart ends with the process that started it. Exi
 SIGTERM, 2 for invalid settings, 1 if the cart cannot be emulated on this machine.
 """
 
+import os
 import sys
 
 from pydantic import ValidationError
@@ -18,6 +19,7 @@ from cartpole_rl.signals import end_with_parent, starting_process
 def main(text: str = "{}") -> int:
     """Run an emulated cart until it is interrupted; return the exit status."""
     end_with_parent(starting_process())
+    os.environ["MUJOCO_GL"] = "disable"  # nothing is drawn: MuJoCo need not import a window library
     try:
         run(read_settings(text))
     except CartPoleError as error:

@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 from torch import Tensor
 
 from cartpole_rl.physics.dynamics import State, advance, mechanism
@@ -78,6 +77,8 @@ def regression(
     data: Transitions, nominal: Mapping[str, float], models: Models, period: float, names: Sequence[str]
 ) -> dict[str, Estimate]:
     """Return the least-squares estimates of the parameters `names`."""
+    from scipy.optimize import least_squares  # slow to import
+
     start = np.array([nominal[name] for name in names])
     scale = np.where(start == 0, 1e-6, np.abs(start))  # force_quadratic is 0
 

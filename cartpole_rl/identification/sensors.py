@@ -20,8 +20,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
-from scipy.signal import savgol_coeffs
 
 from cartpole_rl.identification.fit import correlation
 from cartpole_rl.physics.parameters import GRAVITY
@@ -86,6 +84,8 @@ class Samples:
     """Smoothed motion [K] of all recordings, away from their ends, and the piece of each row."""
 
     def __init__(self, motions: Sequence[Motion], period: float, rows: int) -> None:
+        from scipy.signal import savgol_coeffs  # slow to import
+
         edge, piece = rows // 2, 0
         kept, pieces = [], []
         for motion in motions:
@@ -258,6 +258,7 @@ def angle_estimates(
     samples: Samples, dice: np.random.Generator, on_step: Callable[[], object]
 ) -> tuple[Estimate, Estimate, Estimate]:
     """Return scale and zero of the angle, and the scale of the position."""
+    from scipy.optimize import least_squares  # slow to import
 
     def residuals(guess: Array, weights: Array | None = None) -> tuple[Array, Array]:
         terms, values = samples.pole_terms(*guess), guess[0] * samples.theta_ddot
