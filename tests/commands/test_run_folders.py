@@ -6,8 +6,6 @@ import signal
 import sys
 import time
 from collections.abc import Iterator
-from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +15,7 @@ import yaml
 from command_line import (
     COARSE,
     TINY,
+    console_script,
     in_process,
     interrupt_after,
     no_pictures,
@@ -229,14 +228,12 @@ def test_a_stopped_training_resumes_identically(tmp_path: Path) -> None:
     words = (*TINY, "learning.transitions=4096", "learning.evaluations=8", "buffer=prioritized", "pole=both")
     checkpoint = tmp_path / "stopped/checkpoints/resume.pt"
 
-    training = partial(in_process, "train", *words, "hydra.run.dir=stopped", folder=tmp_path)
-    killed = get_context("fork").Process(target=training)
-    killed.start()
+    killed = console_script("train", *words, "hydra.run.dir=stopped", folder=tmp_path)
     while not checkpoint.exists():
-        assert killed.is_alive()
+        assert killed.poll() is None, killed.communicate()
         time.sleep(0.002)
     killed.kill()
-    killed.join()
+    killed.communicate()
     assert len(history(tmp_path / "stopped")) < 8
 
     interrupt_after(checkpoint, signal.SIGTERM)

@@ -1,7 +1,6 @@
 """The driving process on a scripted cart: confirmation and exit."""
 
 import fcntl
-import multiprocessing
 import os
 import signal
 import sys
@@ -77,17 +76,10 @@ def peer() -> Iterator[Faulty]:
         yield peer
 
 
-@pytest.fixture
-def forked(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fork the process: one that is spawned, as it is elsewhere, imports for seconds."""
-    monkeypatch.setattr(multiprocessing, "get_context", {"spawn": multiprocessing.get_context("fork")}.get)
-
-
 def driver(peer: CartPeer, confirm: Confirm, time_limit: int = LONG) -> Driver:
     return Driver(partial(scripted_env, peer.port, time_limit=time_limit), network, False, confirm)
 
 
-@pytest.mark.usefixtures("forked")
 def test_a_person_who_declines_is_an_error(peer: Faulty, capfd: pytest.CaptureFixture[str]) -> None:
     with driver(peer, lambda text: False) as driving:
         driving.start(EpisodeRequest(as_weights(network()), 0.0, 0))
@@ -98,11 +90,9 @@ def test_a_person_who_declines_is_an_error(peer: Faulty, capfd: pytest.CaptureFi
 
 @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGINT])
 def test_a_hangup_and_ctrl_c_stop_the_motor(
-    number: signal.Signals, peer: Faulty, capfd: pytest.CaptureFixture[str], request: pytest.FixtureRequest
+    number: signal.Signals, peer: Faulty, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """A person confirms; then the terminal signals the process that drives the cart, too."""
-    if number == signal.SIGHUP:
-        request.getfixturevalue("forked")
     asked = []
 
     def confirm(text: str) -> bool:
@@ -133,7 +123,6 @@ def unread(driving: Driver) -> int:
     return int.from_bytes(waiting, sys.byteorder)
 
 
-@pytest.mark.usefixtures("forked")
 def test_a_process_that_is_killed_while_it_sends_an_episode_has_died() -> None:
     """A pipe does not take a whole episode at once, and this process may read it much later."""
     with CartPeer() as peer, driver(peer, lambda text: False, time_limit=2) as driving:
