@@ -223,6 +223,7 @@ def test_runs_that_start_in_the_same_second_do_not_share_a_folder(
 
 
 @pytest.mark.usefixtures("without_pictures")
+@pytest.mark.usefixtures("all_carts")  # as the process that is killed
 def test_a_stopped_training_resumes_identically(tmp_path: Path) -> None:
     """Killed, resumed, terminated, resumed: the same to the bit as one that ran through."""
     words = (*TINY, "learning.transitions=4096", "learning.evaluations=8", "buffer=prioritized", "pole=both")
