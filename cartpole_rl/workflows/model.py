@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from cartpole_rl.choices import choice, group_choices
-from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.recordings import read_recording
 from cartpole_rl.identification.checks import (
     check_directions,
@@ -68,9 +67,6 @@ def learn_model(config: ModelConfig, folder: Path) -> None:
     episodes = [each.episode for each in loaded]
     by_file = {str(path): each for path, each in zip(paths, episodes, strict=True)}
     check_same_encoders(by_file, config.hardware)
-    foreign = config.hardware.scales_text != nominal_hardware().scales_text
-    if foreign and config.pole is None and loaded[0].pole_length is None:
-        raise ConfigError("pole: the recordings do not say which one it is; give the pole of this cart")
     pole_name, pole = chosen_pole("a model", config.pole, loaded)
     period = shared_period(by_file)
     check_each(by_file, period)

@@ -12,6 +12,7 @@ from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.plants.settings import PlantSettings, PortSettings, changed_words, emulated_pole
 from cartpole_rl.randomization.poles import HEAVIER, Pole, PoleSettings, check_one_pole, one_pole
+from cartpole_rl.rig.hardware import nominal_encoders
 from cartpole_rl.run_folder import recorded_config
 
 if TYPE_CHECKING:
@@ -137,12 +138,15 @@ def recorded_pole(
 ) -> tuple[str, Pole]:
     """Return the one of `own` or POLES with the recorded length; the first where no recording states it.
 
-    Raises ConfigError for several lengths or the length of another pole, RecordingError for a damaged one.
+    Raises ConfigError for several lengths, the length of another pole, or none with other encoders than
+    ip02's, and RecordingError for a damaged one.
     """
     shipped = {name: Pole(**choice(f"pole/{name}")["choices"][name]) for name in POLES}
     known = {**(own or {}), **{name: pole for name, pole in shipped.items() if name not in (own or {})}}
     lengths = sorted({length for each in recordings if (length := each.pole_length)})
     if not lengths:
+        if recordings[0].episode.encoders != nominal_encoders():
+            raise ConfigError("pole: the recordings do not say which one it is; give the pole of this cart")
         return next(iter(known.items()))
     if len(lengths) > 1:
         several = ", ".join(f"{length:g}" for length in lengths)

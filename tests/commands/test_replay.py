@@ -72,6 +72,20 @@ def test_the_recorded_pole_is_the_simulated_one(recorded: Path, tmp_path: Path) 
     assert results["pole"] == "large"
 
 
+def test_a_cart_with_other_encoders_does_not_get_the_pole_of_ip02(recorded: Path, tmp_path: Path) -> None:
+    text = (recorded / "recordings/episode_000.csv").read_text()
+    text = text.replace("pole_length_m: 0.3556", "pole_length_m: ").replace(
+        "per_turn: 4096", "per_turn: 4095"
+    )
+    (tmp_path / "log.csv").write_text(text)
+    words = "from=log.csv", "cart=ip02", "cart.pole_counts_per_turn=4095"
+    for verb in ("replay", "model"):
+        done = in_process(verb, *words, folder=tmp_path)
+        assert done.code == 2
+        assert "pole: the recordings do not say which one it is; give the pole of this cart" in done.complaint
+    assert in_process("replay", *words, "pole=medium", folder=tmp_path).code == 0
+
+
 def test_a_chosen_pole_of_another_length_is_warned_of(recorded: Path, tmp_path: Path) -> None:
     warning = "warning: a pole of 0.3556 m was recorded; pole= gives one of 0.6604 m"
     for verb in ("replay", "identify"):
