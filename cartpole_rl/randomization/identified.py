@@ -110,7 +110,7 @@ def identified_carts(
         posterior, identified = read_posterior(settings.posterior)
     except UNREADABLE as error:
         remedy = "copy it again, or run cartpole-identify from=<its run>"
-        if settings.posterior.suffix == ".csv":
+        if settings.posterior.suffix.lower() == ".csv":
             remedy = "write names of parameters in its first line, and a number of each in every other one"
         if isinstance(error, FileNotFoundError):
             error, remedy = (
@@ -121,7 +121,9 @@ def identified_carts(
             f"randomization.posterior={settings.posterior} cannot be read: {error}; {remedy}"
         ) from None
     if not poles.is_single or not is_about(poles.nominal, posterior):
-        if settings.posterior.suffix == ".csv" and (given := posterior.keys() & Pole.model_fields.keys()):
+        if settings.posterior.suffix.lower() == ".csv" and (
+            given := posterior.keys() & Pole.model_fields.keys()
+        ):
             raise ConfigError(
                 f"randomization.posterior={settings.posterior} has {', '.join(sorted(given))} of another "
                 "pole than pole=: leave these columns out, or choose that pole"
@@ -152,7 +154,7 @@ def read_posterior(path: Path) -> tuple[dict[str, Array], list[str]]:
 
     A .csv file has a row for each cart, and all of its columns are identified. Raises UNREADABLE.
     """
-    if path.suffix == ".csv":
+    if path.suffix.lower() == ".csv":
         return read_samples(path)
     with path.open("rb") as file, np.load(file) as stored:
         names, table, identified = (stored[name] for name in ("names", "carts", "identified"))

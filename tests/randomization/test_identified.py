@@ -84,10 +84,12 @@ def test_the_identified_cart_carries_the_given_pole(
     assert {round(mass, 3) for mass in drawn[MASS].tolist()} == {0.9, 1.0}
 
 
-@pytest.fixture
-def sampled(ip02: dict[str, float], medium: PoleSettings, tmp_path: Path) -> Callable[..., IdentifiedCarts]:
+@pytest.fixture(params=["carts.csv", "CARTS.CSV"])
+def sampled(
+    request: pytest.FixtureRequest, ip02: dict[str, float], medium: PoleSettings, tmp_path: Path
+) -> Callable[..., IdentifiedCarts]:
     """The carts of a .csv file; a mass without a column is 2 to 3 kg."""
-    path, ranges = tmp_path / "carts.csv", {"cart_mass": Range(absolute=(2.0, 3.0))}
+    path, ranges = tmp_path / request.param, {"cart_mass": Range(absolute=(2.0, 3.0))}
 
     def build(text: str, **settings: Any) -> IdentifiedCarts:
         path.write_text(text)
