@@ -4,7 +4,7 @@ The first figure shows figures 5.2, 5.3 and 5.5 of the thesis for the identified
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from cartpole_rl.drawing import colours
-from cartpole_rl.identification.experiments import EXPERIMENTS, HELD_OUT
+from cartpole_rl.identification.experiments import EXPERIMENTS
 from cartpole_rl.identification.identify import (
     Candidate,
     Identification,
@@ -41,7 +41,7 @@ CAPTIONS = {  # figures/<name>.png: caption
     "intervals": "Identified values with 95 % intervals, and prior values",
     "experiments": "The experiments (at most 12), measured and simulated; the simulated cart is reset to the "
     "measured state every second",
-    "held_out": "The held-out experiment, which was not used in the fit",
+    "held_out": "What was held out (at most 12) and not used in the fit",
     "unexplained": "Acceleration that the identified cart does not explain, median and quartiles: a cable "
     "or a tooth shows over the position, friction over the speed, a dead-band over the motor value",
     "spectrum": "Remaining uncertainty of each combination of parameters, relative to the prior",
@@ -73,9 +73,12 @@ def error_text(error: PredictionError) -> str:
 
 
 def identification_figures(
-    found: Identification, carts: Array, fitted: Mapping[str, Episode]
+    found: Identification, carts: Array, fitted: Iterable[str], held_out: Iterable[str]
 ) -> dict[str, Figure]:
-    """Return the figures of CAPTIONS; `carts` [P, N] are drawn from the fit to the `fitted` recordings."""
+    """Return the figures of CAPTIONS; `carts` [P, N] are drawn from the fit.
+
+    `fitted` and `held_out` are the names of the recordings.
+    """
     fit, models = found.fit, found.models
     return {
         "friction_and_force": friction_and_force_figure(
@@ -83,13 +86,15 @@ def identification_figures(
             force_curve(fit.parameters, carts, fit.nominal, models.actuator),
         ),
         "intervals": interval_figure(intervals(fit, carts)),
-        "experiments": experiments_figure(
-            dict(evenly([*zip(fitted, found.fitted, strict=True)], MOST_DRAWN))
-        ),
-        "held_out": experiments_figure({HELD_OUT: found.held_out[0]}),
+        "experiments": experiments_figure(_drawn(fitted, found.fitted)),
+        "held_out": experiments_figure(_drawn(held_out, found.held_out)),
         "unexplained": unexplained_figure(unexplained(found.fitted, fit.parameters["latency"])),
         "spectrum": spectrum_figure(fit.covariance, [unknown.name for unknown in fit.unknowns]),
     }
+
+
+def _drawn(names: Iterable[str], replays: Iterable[Replayed]) -> dict[str, Replayed]:
+    return dict(evenly([*zip(names, replays, strict=True)], MOST_DRAWN))
 
 
 def identification_page(

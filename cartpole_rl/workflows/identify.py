@@ -161,7 +161,7 @@ def identify_cart(config: IdentifyConfig, folder: Path, words: Sequence[str] | N
         carts = found.fit.draw(config.carts, np.random.default_rng(config.seed))
         write_choices(found, carts, folder, config.hardware)
         write_json(folder / IDENTIFIED, results(found, carts) | errors(found.fit.parameters, truth, BY_HAND))
-        for name, figure in identification_figures(found, carts, fitted).items():
+        for name, figure in identification_figures(found, carts, fitted, held_out).items():
             save(figure, folder / FIGURES / f"{name}.png")
         identified = intervals(found.fit, carts)
         page = identification_page(found, identified, fitted, next_command(found, folder))
