@@ -21,7 +21,7 @@ SCORES = {  # key in metrics.json: label
     "score_upright": "score upright (6.1)",
     "time_to_upright_s": "time to upright, s",
     "upright_fraction": "share of time upright",
-    "recovered_fraction": "share of falls recovered from",  # None without a fall, as is the next
+    "recovered_fraction": "share of an episode's falls recovered from",  # None without a fall, as is the next
     "recovery_s": "recovery after a fall, s",
     "rms_angle_rad": "RMS angle while upright, rad",
     "rms_position_m": "RMS position while upright, m",
