@@ -19,7 +19,7 @@ WINDOW = 0.5  # s, of the windows that a cart is fitted to
 HISTORY, LEAST_HISTORY = 0.24, 6  # s and periods of motor values before a window: what a residual reads
 JUDGING = 4  # one window in so many judges models that are fitted to the others
 LEAST_LEAD = 5  # periods whose positions give an initial state
-HELD_OUT = 5  # one recording in so many is held out
+HELD_OUT_OF = 5  # one recording in so many is held out
 HELD_OUT_LEAD = 0.2  # s of a held-out window that give its initial state
 UNEVEN = IRREGULAR + 0.01  # the same where stamps are rounded to whole milliseconds
 
@@ -185,13 +185,13 @@ def mean_gap(time: NDArray[np.float64]) -> float:
 
 def split(episodes: Sequence[Episode]) -> tuple[list[Episode], list[Episode]]:
     """Return episodes to learn from and held-out ones: every fifth, or the last fifth of each of a few."""
-    if len(episodes) >= HELD_OUT:
-        chosen = range(HELD_OUT // 2, len(episodes), HELD_OUT)
+    if len(episodes) >= HELD_OUT_OF:
+        chosen = range(HELD_OUT_OF // 2, len(episodes), HELD_OUT_OF)
         return (
             [episode for number, episode in enumerate(episodes) if number not in chosen],
             [episodes[number] for number in chosen],
         )
-    ends = [episode.steps - episode.steps // HELD_OUT for episode in episodes]
+    ends = [episode.steps - episode.steps // HELD_OUT_OF for episode in episodes]
     return (
         [episode.part(0, end) for episode, end in zip(episodes, ends, strict=True)],
         [episode.part(end, episode.steps) for episode, end in zip(episodes, ends, strict=True)],

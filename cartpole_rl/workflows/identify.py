@@ -32,6 +32,7 @@ from cartpole_rl.identification.experiments import EXPERIMENTS, HELD_OUT, conduc
 from cartpole_rl.identification.identify import Identification, identify, intervals, no_force_up_to
 from cartpole_rl.identification.one_step import one_step_estimates
 from cartpole_rl.identification.unknowns import WEIGHED
+from cartpole_rl.identification.windows import HELD_OUT_OF
 from cartpole_rl.physics.laws import Law
 from cartpole_rl.physics.models import REGISTRIES, Models
 from cartpole_rl.physics.parameters import CartParameters
@@ -80,7 +81,6 @@ from cartpole_rl.workflows.poles import warn_of_another_pole
 
 CLOCK = 1e-3  # share by which a clock and the rounding of `shared_period` may change the period
 OF_CART = ("cart", "pole", "control_period")  # settings that belong to recordings
-HELD_OUT_OF = 5  # one recording in so many is held out
 UNIDENTIFIABLE = {  # randomized about the identified cart, since no experiment shows them
     "track_half_length": {"distribution": "uniform", "relative": [-0.1, 0.0]},
     "latency_jitter": {"distribution": "uniform", "absolute": [0.0, 0.002]},
