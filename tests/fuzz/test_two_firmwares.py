@@ -14,7 +14,7 @@ from cartpole_rl.emulator import c_firmware
 from cartpole_rl.rig.hardware import hardware_of
 
 pytestmark = needs_compiler
-SHORT = ("--bytes", "8000", "--frames", "1500")
+SHORT, LONG = (8_000, 1_500), (20_000, 3_000)  # random bytes and frames
 OTHER = {
     "cart_nanometres_per_count": 98_175,
     "pole_counts_per_turn": 1001,
@@ -34,17 +34,23 @@ OTHER = {
 
 
 @pytest.mark.parametrize(
-    ("rig", "seed", "counted"),
-    [({}, "24", " 1 POLE_ENCODER,"), (OTHER, "63", " 2 homings,")],
-    ids=["ip02, with failing encoders", "other, with switches, homed and driven"],
+    ("rig", "seed", "counted", "size"),
+    [
+        pytest.param({}, "24", " 1 POLE_ENCODER,", SHORT, id="ip02, with failing encoders"),
+        pytest.param(OTHER, "63", " 2 homings,", SHORT, id="other, with switches, homed and driven"),
+        pytest.param({}, "3", " 2 POLE_ENCODER,", LONG, id="ip02, longer", marks=pytest.mark.nightly),
+        pytest.param(OTHER, "6", " 1 homings,", LONG, id="other, longer", marks=pytest.mark.nightly),
+    ],
 )
-def test_both_firmwares_agree_under_sanitizers(rig: dict[str, float], seed: str, counted: str) -> None:
+def test_both_firmwares_agree_under_sanitizers(
+    rig: dict[str, float], seed: str, counted: str, size: tuple[int, int]
+) -> None:
     compiler = c_firmware.find_compiler()
     found = subprocess.run([compiler, "-print-file-name=libasan.so"], capture_output=True, text=True)
     if not Path(found.stdout.strip()).is_absolute():
         pytest.skip("needs the address sanitizer of gcc")
-    command = [sys.executable, str(SCRIPTS / "fuzz" / "two_firmwares.py"), *SHORT]
-    words = ["--seed", seed, "--rig", json.dumps(rig)]
+    command = [sys.executable, str(SCRIPTS / "fuzz" / "two_firmwares.py")]
+    words = ["--bytes", f"{size[0]}", "--frames", f"{size[1]}", "--seed", seed, "--rig", json.dumps(rig)]
     done = subprocess.run([*command, *words], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
     assert "no difference" in done.stdout
