@@ -41,13 +41,29 @@ def action_values(agent, layers, h):
     return h
 
 
-def guarded(agent, motor, x, x_dot, end):
+def guarded(agent, motor, now, end):
     """Return `motor`, or full motor inward where the track guard of cartpole_rl/envs/guard.py acts."""
-    side, guard = 0, agent.guard
-    for way in (1, -1) if guard else ():
-        braking = guard.delay * x_dot + x_dot * abs(x_dot) / (2 * guard.deceleration)
-        side += way * (way * (x + braking) + guard.margin > end)
-    return {0: motor, 1: min(0, *agent.motors), -1: max(0, *agent.motors)}[side]
+    for guard in agent.guard.each if agent.guard else ():
+        too_far_right, too_far_left = (
+            side * now["x"] + stopping_distance(guard, now, side) > end for side in (1, -1)
+        )
+        if too_far_right != too_far_left:
+            return min(0, *agent.motors) if too_far_right else max(0, *agent.motors)
+    return motor
+
+
+def stopping_distance(guard, now, side):
+    """Return the way, m, that the cart runs on to one side, 1 or -1, under full motor to the other one."""
+    x_dot = side * now["x_dot"]
+    way = guard.margin + guard.delay * x_dot
+    if guard.pole is None:
+        return way + x_dot * abs(x_dot) / (2 * guard.deceleration)
+    length = guard.pole.length or now["pole_length"]
+    mass = 1 + guard.pole.density * length
+    reach = (mass - 1) / mass * length / 2
+    centre = x_dot + side * reach * now["cos_theta"] * now["theta_dot"]
+    way += guard.pole.swing * reach * (1 + side * now["sin_theta"])
+    return way + mass * centre * abs(centre) / (2 * guard.deceleration)
 
 
 def check_cart(cart, state):
@@ -98,7 +114,7 @@ def drive_armed(cart, agent, layers, pole_length, seconds):
         values = action_values(agent, layers, np.array(observation, np.float32))
         if not np.isfinite([*observation, *values]).all():
             raise PlantError("an observation or an action value is not finite; export another agent")
-        motor = guarded(agent, agent.motors[values.argmax()], now["x"], now["x_dot"], end)
+        motor = guarded(agent, agent.motors[values.argmax()], now, end)
         now["motor"] = cart.set_motor(motor)
         last, upright = state, upright + dt if abs(theta) < math.radians(5) else 0.0
     return upright

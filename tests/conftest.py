@@ -55,9 +55,8 @@ CONF = Path(__file__).parents[1] / "conf"
 os.environ["OMP_NUM_THREADS"] = "1"  # of children
 torch.set_num_threads(1)
 gc.set_threshold(100_000, 50, 100)
-FITTED = {"SAMPLES": guard.SAMPLES, "LEAST_SAMPLES": guard.LEAST_SAMPLES}  # of a track guard
-for name, number in FITTED.items():
-    setattr(guard, name, number // 8)
+FITTED = guard.SAMPLES
+guard.SAMPLES = FITTED // 8
 style.DPI //= 3
 settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("any machine")
@@ -138,8 +137,7 @@ def once(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., tuple[Path, 
 def all_carts() -> Iterator[None]:
     """Fit track guards to as many carts as a command does."""
     with pytest.MonkeyPatch.context() as patch:
-        for name, number in FITTED.items():
-            patch.setattr(guard, name, number)
+        patch.setattr(guard, "SAMPLES", FITTED)
         known_guard_numbers.cache_clear()
         yield
     known_guard_numbers.cache_clear()

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from functools import lru_cache
+from statistics import fmean
 from typing import Any, TypeVar
 
 import torch
@@ -10,12 +11,13 @@ from cartpole_rl.checking import validated
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.guard import fitted_guard
 from cartpole_rl.envs.hardware import HardwareTransform
-from cartpole_rl.envs.settings import CartPoleSettings, ObservationSettings, TrackGuard
+from cartpole_rl.envs.settings import CartPoleSettings, GuardedPole, ObservationSettings, TrackGuard
 from cartpole_rl.physics.models import Models
 from cartpole_rl.plants.learned import model_and_carts
 from cartpole_rl.plants.settings import LearnedSettings, PlantSettings, SimulationSettings
 from cartpole_rl.plants.specs import Plant
 from cartpole_rl.randomization.identified import identified_carts
+from cartpole_rl.randomization.poles import possible_poles
 from cartpole_rl.randomization.randomizer import Draws, Randomizer
 from cartpole_rl.randomization.ranges import IdentifiedSettings
 from cartpole_rl.tasks.rewards import speed_periods
@@ -54,7 +56,7 @@ def with_guard_numbers(config: Config, numbers: TrackGuard | None) -> Config:
 
 @lru_cache(maxsize=64)
 def known_guard_numbers(settings: str) -> TrackGuard:
-    """Return `guard_numbers` of settings as JSON: the fit takes half a second, and many carts share one."""
+    """Return `guard_numbers` of settings as JSON: the fit takes a second, and many carts share one."""
     return guard_numbers(CartPoleSettings.model_validate_json(settings))
 
 
@@ -67,7 +69,17 @@ def guard_numbers(config: CartPoleSettings, plant: PlantSettings | None = None) 
         models = Models(config.cart_friction.model, config.pole_friction.model, config.actions.actuator)
     motors, period = config.actions.motors, config.control_period
     track_end = config.nominal_cart["track_half_length"]
-    return fitted_guard(config.guard.quantile, draws, motors, models, period, track_end)
+    return fitted_guard(config.guard.quantile, draws, motors, models, period, track_end, guarded_pole(config))
+
+
+def guarded_pole(config: CartPoleSettings) -> GuardedPole:
+    """Return the poles of `config` as a track guard knows them, without a swing."""
+    cart, poles = config.nominal_cart, possible_poles(config.pole)
+    density = (
+        cart["backdrivability"] / cart["cart_mass"] * fmean(each.pole_mass / each.length for each in poles)
+    )
+    length = None if config.observation.pole_length else fmean(each.length for each in poles)
+    return GuardedPole(swing=0, density=density, length=length)
 
 
 def make_env(

@@ -6,63 +6,98 @@ It lies above the limits of the cart (soft and hard limit, docs/protocol.md) and
 A cart at position x with speed v, both positive to the right, is predicted to come to rest, under full motor
 to the left, at
 
-    x + margin + delay v + v |v| / (2 deceleration)
+    x + margin + delay v + swing (r + r sin theta) + (1 + mu) V |V| / (2 deceleration)
 
-Beyond the track's end, the guard replaces the agent's motor value by full motor to the left; likewise on the
-left.
+If that is beyond the track's end, the guard replaces the agent's motor value by full motor to the left;
+likewise on the left. If both sides are too near, it does nothing.
 
-The three numbers are fitted to the carts in question. Carts are drawn as in training and put into random
-states: a speed, an angle of the pole, and an energy of the pole up to somewhat more than upright. Each has
-full motor outward under way, keeps it for one more period, since the guard decides once a period, and then
-brakes with full motor inward. Half of them run to the right, half to the left: carts may brake better in one
-direction. A share `quantile` of each half stays within some way, which depends on the measured speed. The
-guard's way bounds it from above as closely as possible: a linear program in margin, delay and
-1 / deceleration. A cart that is braked by its motor's back-EMF runs on in proportion to its speed: its guard
-has the deceleration FASTEST.
+Motor and friction brake the centre of mass of cart and pole, whatever the pole does. It is r sin theta to the
+right of the cart and moves with V = v + r cos(theta) theta_dot. Here mu is the pole's mass over the cart's,
+which is `density` times the pole's length, and r = mu / (1 + mu) times the distance from pivot to the pole's
+centre of mass. When the centre of mass rests, the cart is at most r to the right of it, so it runs on by
+r + r sin theta more at most; `swing` is the share of that which is reserved.
+
+Margin, delay, swing and deceleration are fitted to the carts in question. Carts are drawn as in training and
+put into random states: a speed, an angle of the pole, and an energy of the pole up to somewhat more than
+upright. Each has full motor outward under way, keeps it for one more period, since the guard decides once a
+period, and then brakes with full motor inward. A quantile regression (Koenker and Bassett, "Regression
+quantiles", Econometrica, 1978) finds the four numbers, none negative, with which a share `quantile` of the
+carts stays within the way that is predicted from what was measured. It is made for the carts that run to the
+right and for those that run to the left, since carts may brake better in one direction; the guard has the
+largest margin, delay and swing and the least deceleration. A cart that is braked by its motor's back-EMF runs
+on in proportion to its speed: its guard has the deceleration FASTEST.
+
+The guards of older agents have no `pole`: theirs is the formula with the cart's speed alone.
 """
 
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cartpole_rl.envs.settings import LARGEST_MARGIN, TrackGuard
+from cartpole_rl.envs.settings import LARGEST_MARGIN, GuardedPole, TrackGuard
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.physics.dynamics import Drive, State, run_period
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import GRAVITY, CartParameters
 from cartpole_rl.plants.simulated import commands_under_way
 from cartpole_rl.randomization.randomizer import Draws
+from cartpole_rl.tasks.features import Measured
 
 Number = TypeVar("Number", float, Tensor)
 
 # The fit
-SAMPLES = 65536
+SAMPLES = 32768
 SPEEDS = (0.0, 2.2)  # m/s, of the cart at the start; agents of the shipped experiments stay within
-BIN = 0.1  # m/s
-LEAST_SAMPLES = 500  # in a bin, for its quantile
 MOST_ENERGY = 1.3  # of the pole, as a multiple of that of the upright pole at rest, above hanging
 BRAKING = 1.2, 5.0  # s, at least and at most; the slowest carts of randomization=wide stop within 1
 STOPPED = 0.01  # m/s
 FASTEST = 100.0  # m/s^2, the largest deceleration
 SUBSTEPS = 4
 
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
+
+# the rule
+
+
+class Centre(NamedTuple):
+    """Where the centre of mass of cart and pole is and how it moves, positive to the right; [N] or floats."""
+
+    mass: Tensor | float  # of cart and pole, over the cart's: 1 + mu
+    reach: Tensor | float  # m, its largest distance from the cart: r
+    offset: Tensor  # m, from the cart: r sin theta
+    speed: Tensor  # m/s: V
+
+    @property
+    def mirrored(self) -> "Centre":
+        """The same with left and right swapped."""
+        return self._replace(offset=-self.offset, speed=-self.speed)
+
+
+def centre_of_mass(motion: Measured, pole: GuardedPole, length: Tensor | None) -> Centre:
+    """Return the centre of mass of carts; `length` [N] m is read where the guard's pole has none."""
+    known = length if pole.length is None else pole.length
+    assert known is not None
+    mass = 1 + pole.density * known
+    reach = (mass - 1) / mass * known / 2
+    turning = reach * torch.cos(motion.theta) * motion.theta_dot
+    return Centre(mass, reach, reach * torch.sin(motion.theta), motion.x_dot + turning)
 
 
 def stopping_distance(x_dot: Number, guard: TrackGuard) -> Number:
-    """Return the way to the right, m, that a cart of speed `x_dot` m/s makes under full motor to the left."""
+    """Return the way to the right, m, that a cart of speed `x_dot` m/s makes under full motor to the left.
+
+    The guard is one without a pole.
+    """
     return guard.margin + guard.delay * x_dot + x_dot * abs(x_dot) / (2 * guard.deceleration)
 
 
 def guard_side(x: Number, x_dot: Number, track_end: Number | float, guard: TrackGuard) -> Number:
-    """Return the direction of the guard's full motor: 1 to the right, -1 to the left, 0 if it is not needed.
+    """Return the direction of the full motor of a guard without a pole, as `guard_direction` does.
 
     `x` m from the middle of the track, `x_dot` m/s, `track_end` m, all floats or [N].
     """
@@ -71,38 +106,82 @@ def guard_side(x: Number, x_dot: Number, track_end: Number | float, guard: Track
     return 1 * too_far_left - 1 * too_far_right
 
 
+def swinging_distance(x_dot: Tensor, centre: Centre, guard: TrackGuard, pole: GuardedPole) -> Tensor:
+    """Return the way to the right, m, that a cart with a pole makes under full motor to the left."""
+    braked = centre.mass * centre.speed * centre.speed.abs() / (2 * guard.deceleration)
+    return guard.margin + guard.delay * x_dot + pole.swing * (centre.reach + centre.offset) + braked
+
+
+def guard_direction(
+    motion: Measured, track_end: Tensor, guard: TrackGuard, length: Tensor | None = None
+) -> Tensor:
+    """Return the direction of the guard's full motor: 1 to the right, -1 to the left, 0 if it is not needed.
+
+    `track_end` [N] is m from the middle of the track; `length` [N] m is the pole's, if it is observed.
+    """
+    direction, *others = (own_direction(motion, track_end, each, length) for each in guard.each)
+    for other in others:
+        direction = torch.where(direction == 0, other, direction)
+    return direction
+
+
+def own_direction(motion: Measured, track_end: Tensor, guard: TrackGuard, length: Tensor | None) -> Tensor:
+    """Return the direction without that of a second guard."""
+    x, x_dot = motion.x, motion.x_dot
+    if guard.pole is None:
+        return guard_side(x, x_dot, track_end, guard)
+    centre = centre_of_mass(motion, guard.pole, length)
+    right = swinging_distance(x_dot, centre, guard, guard.pole)
+    left = swinging_distance(-x_dot, centre.mirrored, guard, guard.pole)
+    return 1 * (-x + left > track_end) - 1 * (x + right > track_end)
+
+
+# the fit
+
+
 def fitted_guard(
-    quantile: float, draws: Draws, motors: Sequence[int], models: Models, period: float, track_end: float
+    quantile: float,
+    draws: Draws,
+    motors: Sequence[int],
+    models: Models,
+    period: float,
+    track_end: float,
+    pole: GuardedPole,
 ) -> TrackGuard:
     """Return the guard that a share `quantile` of the carts of `draws` obeys in time.
 
     `motors` are the motor values of the agent, `period` is the control period, s, `track_end` is half the
-    track, m. Raises ConfigError if full motor does not brake the carts, or so late that they need most of it.
+    track, m; the swing of `pole` is fitted. Raises ConfigError if full motor does not brake the carts, or so
+    late that they need most of it.
     """
     if not min(motors) < 0 < max(motors):
         raise ConfigError(f"guard: actions.motors={list(motors)} brake in one direction; choose guard=none")
     with one_thread():
-        speed, way, rightward = braking_distances(draws, motors, models, period)
-    if not np.isfinite(speed).all() or np.isnan(way).any():
+        brakings = braking_distances(draws, motors, models, period)
+    if not all(each.isfinite().all() for each in brakings.motion) or brakings.way.isnan().any():
         raise ConfigError(
             "guard: simulated carts brake to numbers that are not finite; check cart.*, or guard=none"
         )
-    halves = [quantiles(speed[half], way[half], quantile) for half in (rightward, ~rightward)]
-    middles, ways = map(np.concatenate, zip(*halves, strict=True))
-    if not np.isfinite(ways).all():
+    halves = [brakings.rows(half) for half in (brakings.rightward, ~brakings.rightward)]
+    if any(half.way.isinf().float().mean() > 1 - quantile for half in halves):
         raise ConfigError(
             "guard: full motor does not stop these carts; check masses (kg) and forces (N), choose other "
             "actions, or guard=none"
         )
-    margin, delay, curvature = closest_bound(middles, ways)
-    largest = min(LARGEST_MARGIN, track_end)
-    if round(margin, 4) >= largest:
+    numbers = np.max([least_bound(half, pole, quantile) for half in halves], 0).clip(min=0) + 0.0
+    margin, delay, swing, curvature = numbers.tolist()
+    pole = pole.model_copy(update={"swing": round(swing, 4)})
+    reach = float(torch.as_tensor(centre_of_mass(brakings.motion, pole, brakings.length).reach).max())
+    at_rest, margin = margin + swing * reach, round(margin, 4)
+    if margin >= LARGEST_MARGIN or at_rest >= track_end:
+        way, largest = (at_rest, track_end) if at_rest >= track_end else (margin, LARGEST_MARGIN)
         raise ConfigError(
-            f"guard: even from rest these carts run on by {margin:.3f} m before full motor stops them; this "
-            f"margin must be below {largest:g} m: give a shorter control_period, less latency or "
-            "smaller motor values, or guard=none"
+            f"guard: even from rest these carts run on by {way:.3f} m before full motor stops them; this "
+            f"margin must be below {largest:g} m: give a shorter control_period, less latency, "
+            "smaller motor values or a smaller guard.quantile, or guard=none"
         )
-    return TrackGuard(margin=round(margin, 4), delay=round(delay, 4), deceleration=round(0.5 / curvature, 3))
+    deceleration = round(0.5 / max(curvature, 0.5 / FASTEST), 3)
+    return TrackGuard(margin=margin, delay=round(delay, 4), deceleration=deceleration, pole=pole)
 
 
 @contextmanager
@@ -120,17 +199,24 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def braking_distances(
-    draws: Draws, motors: Sequence[int], models: Models, period: float
-) -> tuple[Array, Array, Flags]:
-    """Return measured speeds, m/s, ways that carts run on, m, and which run to the right, [SAMPLES] each.
+class Brakings(NamedTuple):
+    """Carts when they begin to brake, and how far they run on; [N] each."""
 
-    Speeds and ways are positive in the direction of motion. The way of a cart that still runs on after the
-    longest time of BRAKING is infinite.
-    """
+    motion: Measured  # as measured; mirrored for a cart that runs to the left
+    length: Tensor  # m, of the pole
+    rightward: Tensor  # bool: the cart runs to the right
+    way: Tensor  # m, in the direction of motion; infinite if it runs on after the longest time of BRAKING
+
+    def rows(self, rows: Tensor) -> "Brakings":
+        """Return some of them."""
+        motion = Measured(*(each[rows] for each in self.motion))
+        return Brakings(motion, self.length[rows], self.rightward[rows], self.way[rows])
+
+
+def braking_distances(draws: Draws, motors: Sequence[int], models: Models, period: float) -> Brakings:
+    """Return SAMPLES brakings of carts in random states."""
     generator = torch.Generator().manual_seed(0)
-    table = draws.draw(SAMPLES, generator)
-    cart = CartParameters(table)
+    cart = CartParameters(draws.draw(SAMPLES, generator))
     rightward = torch.arange(SAMPLES) % 2 == 0
     side = torch.where(rightward, 1.0, -1.0)
     state = random_states(cart, generator)
@@ -140,7 +226,9 @@ def braking_distances(
     outward, inward = torch.where(rightward, right, left), torch.where(rightward, left, right)
     drive = Drive(models.actuator(outward, cart), [outward] * commands)
     before, (state, drive) = state, run_period(state, drive, cart.latency, cart, models, period, SUBSTEPS)
-    speed, start, farthest = side * (state.x - before.x) / period, state.x, torch.zeros(SAMPLES)
+    speeds = (state.x - before.x) / period, (state.theta - before.theta) / period
+    motion = Measured(torch.zeros(SAMPLES), side * speeds[0], side * state.theta, side * speeds[1])
+    start, farthest = state.x, torch.zeros(SAMPLES)
     runs_on = torch.ones(SAMPLES, dtype=torch.bool)
     least, most = (math.ceil(each / period) for each in BRAKING)
     for step in range(most):
@@ -151,7 +239,7 @@ def braking_distances(
         farthest = torch.maximum(farthest, side * (state.x - start))
         runs_on = side * state.x_dot > STOPPED
     farthest[runs_on] = math.inf
-    return speed.double().numpy(), farthest.double().numpy(), rightward.numpy()
+    return Brakings(motion, cart.pole_length.clone(), rightward, farthest)
 
 
 def random_states(cart: CartParameters, generator: torch.Generator) -> State:
@@ -168,26 +256,21 @@ def random_states(cart: CartParameters, generator: torch.Generator) -> State:
     return State(torch.zeros(count), uniform(*SPEEDS), theta, theta_dot)
 
 
-def quantiles(speed: Array, way: Array, quantile: float) -> tuple[Array, Array]:
-    """Return the middles of bins of `speed`, m/s, and the quantile of the `way` in each, m."""
-    bins = np.floor(speed / BIN).astype(int)
-    middles, ways = [], []
-    for number in np.unique(bins):
-        inside = bins == number
-        if inside.sum() >= LEAST_SAMPLES:
-            middles.append((number + 0.5) * BIN)
-            with np.errstate(invalid="ignore"):  # between two infinite ways
-                ways.append(np.quantile(way[inside], quantile))
-    return np.array(middles), np.array(ways)
+def least_bound(brakings: Brakings, pole: GuardedPole, quantile: float) -> NDArray[np.float64]:
+    """Return margin, delay, swing and 1 / (2 deceleration), which a share `quantile` of `brakings` obeys.
 
-
-def closest_bound(speed: Array, way: Array) -> tuple[float, float, float]:
-    """Return (margin m, delay s, curvature s^2/m) of the least upper bound on `way` that is a guard's."""
+    The quantile regression is solved as its dual linear program, which has one variable for each braking.
+    Raises ConfigError if the solver fails.
+    """
     from scipy.optimize import linprog  # slow to import
 
-    terms = np.stack((np.ones_like(speed), speed, speed * np.abs(speed)), 1)
-    result = linprog(
-        terms.sum(0), A_ub=-terms, b_ub=-way, bounds=[(0, None), (0, None), (0.5 / FASTEST, None)]
-    )
-    margin, delay, curvature = result.x
-    return float(margin), float(delay), float(curvature)
+    centre = centre_of_mass(brakings.motion, pole, brakings.length)
+    braked = centre.mass * centre.speed * centre.speed.abs()
+    rows = (torch.ones_like(braked), brakings.motion.x_dot, centre.reach + centre.offset, braked)
+    terms, way = torch.stack(rows).double().numpy(), brakings.way.double().numpy()
+    way = np.minimum(way, 1e3)  # only which side of the bound they are on matters
+    shares = max(1 - quantile, 1 / len(way)) * terms.sum(1)  # all of them would leave the numbers open
+    result = linprog(-way, A_ub=terms, b_ub=shares, bounds=(0, 1), method="highs-ipm")
+    if not result.success:
+        raise ConfigError(f"guard: its numbers could not be fitted ({result.message}); check cart.*")
+    return -np.asarray(result.ineqlin.marginals)

@@ -49,6 +49,7 @@ from torchrl.envs import Transform
 from cartpole_rl.compilation import Compiled
 from cartpole_rl.envs.perception import Percept, Previous, perceive, perceive_first
 from cartpole_rl.envs.settings import ObservationSettings, TrackGuard
+from cartpole_rl.errors import ConfigError
 from cartpole_rl.plants.specs import Plant, PlantOutput, tensordict_of
 from cartpole_rl.rig.hardware import Encoders, nominal_encoders
 from cartpole_rl.tasks.features import LENGTH_SCALE
@@ -79,6 +80,8 @@ class HardwareTransform(Transform):
         self.register_buffer("motors", torch.tensor(list(motors), dtype=torch.int64))
         inward = torch.tensor([0, max(0, *motors), min(0, *motors)])  # by the guard's direction: 0, 1, -1
         self.register_buffer("inward", inward)
+        if guard and guard.reads_length and not observation.pole_length:
+            raise ConfigError("guard.numbers: the agent does not observe its pole; give pole.length in m")
         self.guard = guard
         self.register_buffer("_by_action", torch.tensor([0, *motors], dtype=torch.int64))  # from NO_ACTION on
         self.first_perception = partial(

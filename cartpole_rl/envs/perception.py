@@ -9,12 +9,13 @@ from typing import Generic, NamedTuple
 import torch
 from torch import Tensor
 
-from cartpole_rl.envs.guard import guard_side
+from cartpole_rl.envs.guard import guard_direction
 from cartpole_rl.envs.settings import ObservationSettings, TrackGuard
 from cartpole_rl.plants.specs import PlantOutput, Values
 from cartpole_rl.rig.hardware import Encoders
 from cartpole_rl.tasks.features import (
     ANGULAR_SPEED_SCALE,
+    LENGTH_SCALE,
     MOTOR_SCALE,
     SPEED_SCALE,
     Measured,
@@ -78,7 +79,7 @@ def perceive_first(
         past,
         x.new_zeros(speed_periods - 1, len(x)),
         observation(state, past, length, settings),
-        guarded(state, track_end, guard),
+        guarded(state, track_end, length, guard),
         nothing,
         nothing.clone(),
         nothing.clone(),
@@ -118,7 +119,7 @@ def perceive(
         past,
         speeds[:-1],
         observation(state, past, previous.length, settings),
-        guarded(state, previous.track_end, guard),
+        guarded(state, previous.track_end, previous.length, guard),
         rewards.scale * values[rewards.kind] - track_cost(x, off_track, task, rewards),
         values[SCORE],
         values[SCORE_UPRIGHT],
@@ -156,11 +157,15 @@ def observation(state: Measured, past: Tensor, length: Tensor, settings: Observa
     return torch.cat((torch.stack(observe(state, settings.kind)), past, length))
 
 
-def guarded(state: Measured, track_end: Tensor, guard: TrackGuard | None) -> Tensor:
-    """Return the direction of the track guard's motor value, int64 [1, N]; 0 without a guard."""
+def guarded(state: Measured, track_end: Tensor, length: Tensor, guard: TrackGuard | None) -> Tensor:
+    """Return the direction of the track guard's motor value, int64 [1, N]; 0 without a guard.
+
+    `length` is the scaled length of the pole, [1, N], or [0, N].
+    """
     if guard is None:
         return torch.zeros_like(track_end, dtype=torch.int64)
-    return guard_side(state.x, state.x_dot, track_end[0], guard).unsqueeze(0)
+    observed = length[0] * LENGTH_SCALE if len(length) else None
+    return guard_direction(state, track_end[0], guard, observed).unsqueeze(0)
 
 
 def track_cost(x: Tensor, off_track: Tensor, task: TaskSettings, rewards: RewardSettings) -> Tensor:

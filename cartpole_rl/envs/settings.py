@@ -4,7 +4,14 @@ from collections.abc import Mapping
 from functools import cache
 from typing import Annotated, Any
 
-from pydantic import Discriminator, Field, Tag, field_validator
+from pydantic import (
+    Discriminator,
+    Field,
+    SerializerFunctionWrapHandler,
+    Tag,
+    field_validator,
+    model_serializer,
+)
 
 from cartpole_rl.choices import group_choices
 from cartpole_rl.physics.friction import CART_FRICTIONS, POLE_FRICTIONS
@@ -65,24 +72,44 @@ class ObservationSettings(Settings):
         return [[*range(place, place + size), size + age] for age, place in enumerate(places)][::-1]
 
 
+class GuardedPole(Settings):
+    """The pole in a track guard: see `envs/guard.py`."""
+
+    swing: NonNegative  # share of the way that the swinging pole can move the cart
+    density: NonNegative  # 1/m: mass of the pole over its length and over the cart's mass
+    length: Annotated[float, Field(gt=0, le=3)] | None = None  # m; None: as the agent observes it
+
+
 class TrackGuard(Settings):
     """The numbers of a track guard: see `envs/guard.py`."""
 
     margin: Annotated[float, Field(ge=0, lt=LARGEST_MARGIN)]  # m
     delay: NonNegative  # s
-    deceleration: Positive  # m/s^2
+    deceleration: Positive  # m/s^2, of the cart without its pole; with it where there is no `pole`
+    pole: GuardedPole | None = None
+    also: "TrackGuard | None" = None  # a second guard: either one may brake
 
-    def at_least(self, other: "TrackGuard") -> "TrackGuard":
-        """Return a guard that brakes a cart on its way outward as early as both, or earlier."""
-        return TrackGuard(
-            margin=max(self.margin, other.margin),
-            delay=max(self.delay, other.delay),
-            deceleration=min(self.deceleration, other.deceleration),
-        )
+    @model_serializer(mode="wrap")
+    def _as_earlier(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out what a guard of an earlier version does not have: exported agents have a checksum."""
+        return {name: value for name, value in serialize(self).items() if value is not None}
+
+    @property
+    def each(self) -> list["TrackGuard"]:
+        """The guard, and the others that brake."""
+        return [self, *(self.also.each if self.also else ())]
+
+    @property
+    def reads_length(self) -> bool:
+        """True if it needs the length of the pole that the agent observes."""
+        return any(each.pole and each.pole.length is None for each in self.each)
 
     def __str__(self) -> str:
         """Return the numbers with their units."""
-        return f"margin {self.margin:g} m, delay {self.delay:g} s, deceleration {self.deceleration:g} m/s^2"
+        pole = f" (pole of {self.pole.length:.2f} m)" if self.pole and self.pole.length else ""
+        swing = f", swing {self.pole.swing:g}{pole}" if self.pole else ""
+        own = f"margin {self.margin:g} m, delay {self.delay:g} s, deceleration {self.deceleration:g} m/s^2"
+        return f"{own}{swing}" + (f"; also {self.also}" if self.also else "")
 
 
 class GuardSettings(Settings):

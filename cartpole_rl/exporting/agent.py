@@ -91,7 +91,8 @@ class Description(Settings):
         """True if the parts that repeat each other agree."""
         ends = len(self.numbers), len(self.motors)
         agree = ends == (self.sizes[0], self.sizes[-1])
-        return agree and self.numbers == observed_numbers(self.observation)
+        known = self.observation.pole_length or not (self.guard and self.guard.reads_length)
+        return agree and known and self.numbers == observed_numbers(self.observation)
 
     def shapes(self) -> Iterator[tuple[str, tuple[int, ...]]]:
         """Yield the name and the shape of each array of weights."""

@@ -4,10 +4,11 @@ An experiment consists of moves. A move is a generator: it yields the motor valu
 sent the observation at its end. Only motor values and encoder positions go in and out, so that any plant can
 be used. A guard keeps the cart clear of the track's ends: it brakes, whatever the experiment.
 
-The guard brakes a cart that is not known yet, at any control period T. It has the form of the track guard
-(`envs/guard.py`). If it lets a cart run, the next command in force comes T + RESPONSE later. Until then the
-cart may gain speed at the rate ACCELERATION, and it already has gained some: the measured speed is half a
-period old. A cart of measured speed v that is braked just as hard, a = ACCELERATION, therefore runs on by
+The guard brakes a cart that is not known yet, at any control period T. It has the form of a track guard
+without a pole (`envs/guard.py`). If it lets a cart run, the next command in force comes T + RESPONSE later.
+Until then the cart may gain speed at the rate ACCELERATION, and it already has gained some: the measured
+speed is half a period old. A cart of measured speed v that is braked just as hard, a = ACCELERATION,
+therefore runs on by
 
     (v + a T / 2) t + a t^2 / 2 + (v + a g)^2 / (2 a),    t = T + RESPONSE,    g = t + T / 2,
 

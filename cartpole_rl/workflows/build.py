@@ -146,8 +146,12 @@ def compiled_training(trained: TrainedAgent) -> TrainConfig:
     others = [pole for pole in trained.known_poles if not guard_holds(training.pole, pole)]
     driven = [with_guard_numbers(training, None).model_copy(update={"pole": pole}) for pole in others]
     guards = [each.guard.active for each in (training, *map(with_fitted_guard, driven)) if each.guard.active]
-    numbers = reduce(TrackGuard.at_least, guards)
-    return with_guard_numbers(training, numbers)
+    return with_guard_numbers(training, reduce(together, guards))
+
+
+def together(first: TrackGuard, second: TrackGuard) -> TrackGuard:
+    """Return a guard that brakes where one of two does; the second one is a single guard."""
+    return second.model_copy(update={"also": first})
 
 
 def exported_agent(trained: TrainedAgent, origin: Mapping[str, Any]) -> ExportedAgent:

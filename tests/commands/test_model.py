@@ -1,6 +1,7 @@
 """A model is learned from recordings, judged by what it did not see, and is a plant to train on."""
 
 import json
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -8,15 +9,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 import yaml
 from command_line import ENSEMBLE, ONCE, TINY, Outcome, in_process
 
 from cartpole_rl.envs.build import driven_carts, simulated_env, with_fitted_guard
-from cartpole_rl.envs.guard import stopping_distance
+from cartpole_rl.envs.guard import centre_of_mass, swinging_distance
 from cartpole_rl.evaluation.recordings import read_recording, write_recording
 from cartpole_rl.plants.learned import load_model, save_model
 from cartpole_rl.run_folder import experiments
 from cartpole_rl.tasks.episode import Episode
+from cartpole_rl.tasks.features import Measured
 from cartpole_rl.terminal import noting
 from cartpole_rl.workflows.config import TrainConfig, load_settings
 from cartpole_rl.workflows.model import next_command
@@ -140,7 +143,12 @@ def test_its_guard_is_that_of_its_carts(learned: tuple[Path, Outcome], tmp_path:
     }
     config = load_settings(TrainConfig, settings)
     own, wide = (with_fitted_guard(config, plant).guard.active for plant in (config.plant, None))
-    assert stopping_distance(1.0, own) > stopping_distance(1.0, wide) + 0.03
+    hanging = Measured(*torch.tensor([[0.0], [1.0], [math.pi], [0.0]]))
+    ways = [
+        swinging_distance(hanging.x_dot, centre_of_mass(hanging, guard.pole, None), guard, guard.pole)
+        for guard in (own, wide)
+    ]
+    assert ways[0] > ways[1] + 0.03
     assert simulated_env(config, config.plant, 2, config.task.start, 0).hardware.guard == own
 
 

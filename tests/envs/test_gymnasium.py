@@ -43,7 +43,7 @@ except ImportError:
     del sys.modules['gymnasium.core']
 import torchrl.envs, gymnasium, torch
 from cartpole_rl.envs import guard
-guard.SAMPLES, guard.LEAST_SAMPLES = guard.SAMPLES // 8, guard.LEAST_SAMPLES // 8
+guard.SAMPLES //= 8
 torch.set_num_threads(2)
 print(sorted(name for name in gymnasium.registry if 'cartpole' in name))
 envs = gymnasium.make_vec("cartpole_rl/Balance-v0", 1, "async", vector_kwargs={"context": "fork"})

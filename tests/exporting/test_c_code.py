@@ -28,11 +28,18 @@ from cartpole_rl.workflows.config import TrainConfig, load_settings
 FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Wconversion", "-Wpedantic", "-Wdouble-promotion", "-Werror")
 SIZE = '#include "policy.h"\n#include <stddef.h>\nsize_t policy_size(void);\n'
 SIZE += "size_t policy_size(void)\n{\n    return sizeof(policy_t);\n}\n"
+WITHOUT_POLE = {"margin": 0.02, "delay": 0.1, "deceleration": 6.0}
+TWO_GUARDS = {**WITHOUT_POLE, "pole": {"swing": 0.9, "density": 0.5, "length": 0.36}, "also": WITHOUT_POLE}
 AGENTS: dict[str, dict[str, Any]] = {
     "raw": {"observation": "raw", "agent.hidden": [], "agent.mirrored": False, "guard": "none"},
     "positions": {"observation": "positions", "agent.hidden": [8], "agent.mirrored": True},
     "length": {"observation": "history_length", "pole": "range", "agent.hidden": [8, 6, 4]},
-    "plain": {"agent.hidden": [8, 6], "agent.layer_norm": False, "actions": "two"},
+    "plain": {
+        "agent.hidden": [8, 6],
+        "agent.layer_norm": False,
+        "actions": "two",
+        "guard.numbers": TWO_GUARDS,
+    },
 }
 
 pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="gcc is missing: install a C compiler")

@@ -101,7 +101,7 @@ def test_identified_carts_carry_the_other_pole_when_it_is_fitted_anew(tmp_path: 
     training = fitted(randomization=of_one_cart)
     numbers = evaluated(training, **SERIAL, **{"plant.pole_length": 0.66})[0].guard.active
     assert numbers == fitted(randomization=of_one_cart, pole="large").guard.active
-    assert numbers.delay > 1.1 * training.guard.active.delay
+    assert numbers.pole.length == pytest.approx(0.6604)
 
 
 @pytest.mark.parametrize(
@@ -113,7 +113,7 @@ def test_it_is_fitted_anew_to_a_heavier_pole_of_the_same_length(
 ) -> None:
     """Rods of 0.36 m have 0.25 kg in training."""
     pole = {"choices": {"mine": {"pole_mass": mass, "pole_com": 0.1778, "pole_inertia": 2e-3}}}
-    training = fitted(pole=trained, randomization="half")
+    training = fitted(pole=trained, randomization="half", guard="fitted")
     settings, note = evaluated(training, **SERIAL, pole=pole)
     assert (settings.guard != training.guard) == bool(note) == is_refitted
 

@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from cartpole_rl.choices import group_choices
-from cartpole_rl.envs.build import with_fitted_guard
+from cartpole_rl.envs.build import with_fitted_guard, with_guard_numbers
+from cartpole_rl.envs.settings import TrackGuard
 from cartpole_rl.learning.checkpoints import AgentCheckpoint, save_agent
 from cartpole_rl.randomization.poles import Pole, PoleSettings
 from cartpole_rl.workflows.build import (
@@ -14,6 +15,7 @@ from cartpole_rl.workflows.build import (
     evaluated_settings,
     exported_agent,
     new_agent,
+    together,
     trained_agent,
 )
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig, load_settings
@@ -93,8 +95,8 @@ def test_it_is_exported_with_a_track_guard_for_all_poles_that_it_knows(
         with on_the_board(config, tuned, settings) as equipped:  # not refused
             assert equipped == config
     assert numbers["medium"] == of_pole["medium"]
-    assert numbers["large"] == of_pole["medium"].at_least(of_pole["large"])
-    assert numbers["large"].delay == of_pole["large"].delay > 1.2 * of_pole["medium"].delay
+    assert numbers["large"] == together(of_pole["medium"], of_pole["large"])
+    assert [each.pole.length for each in numbers["large"].each] == pytest.approx([0.6604, 0.3556])
 
 
 @pytest.mark.usefixtures("all_carts")
@@ -105,8 +107,19 @@ def test_an_agent_of_the_large_pole_that_was_tuned_on_a_shorter_one_keeps_its_gu
     agent = replace(agent, config=training.model_dump(mode="json"))
     save_agent(tmp_path / "agent", TunedAgent(training, agent, None).checkpoint(Stage.AFTER, 20.0, MEDIUM))
     compiled = compiled_training(trained_agent(tmp_path / "agent")).guard.active
-    assert compiled.delay == training.guard.active.delay
-    assert compiled.deceleration == training.guard.active.deceleration
+    assert compiled.also == training.guard.active
+
+
+def test_an_agent_of_an_earlier_version_keeps_its_guard_beside_that_of_another_pole(
+    training: TrainConfig, agent: AgentCheckpoint, tmp_path: Path
+) -> None:
+    earlier = TrackGuard(margin=0.01, delay=0.1, deceleration=6.0)
+    agent = replace(agent, config=with_guard_numbers(training, earlier).model_dump(mode="json"))
+    assert set(agent.config["guard"]["numbers"]) == {"margin", "delay", "deceleration"}
+    save_agent(tmp_path / "agent", TunedAgent(training, agent, None).checkpoint(Stage.AFTER, 20.0, LARGE))
+    compiled = compiled_training(trained_agent(tmp_path / "agent")).guard.active
+    assert compiled.also == earlier
+    assert compiled.pole.length == pytest.approx(0.6604)
 
 
 def test_a_checkpoint_without_tuned_poles_is_read(agent: AgentCheckpoint, tmp_path: Path) -> None:
