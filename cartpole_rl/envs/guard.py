@@ -73,6 +73,11 @@ class Centre(NamedTuple):
     speed: Tensor  # m/s: V
 
     @property
+    def braked(self) -> Tensor:
+        """The way of the braked centre times twice the deceleration, (m/s)^2: (1 + mu) V |V|."""
+        return self.mass * self.speed * self.speed.abs()
+
+    @property
     def mirrored(self) -> "Centre":
         """The same with left and right swapped."""
         return self._replace(offset=-self.offset, speed=-self.speed)
@@ -108,7 +113,7 @@ def guard_side(x: Number, x_dot: Number, track_end: Number | float, guard: Track
 
 def swinging_distance(x_dot: Tensor, centre: Centre, guard: TrackGuard, pole: GuardedPole) -> Tensor:
     """Return the way to the right, m, that a cart with a pole makes under full motor to the left."""
-    braked = centre.mass * centre.speed * centre.speed.abs() / (2 * guard.deceleration)
+    braked = centre.braked / (2 * guard.deceleration)
     return guard.margin + guard.delay * x_dot + pole.swing * (centre.reach + centre.offset) + braked
 
 
@@ -265,8 +270,8 @@ def least_bound(brakings: Brakings, pole: GuardedPole, quantile: float) -> NDArr
     from scipy.optimize import linprog  # slow to import
 
     centre = centre_of_mass(brakings.motion, pole, brakings.length)
-    braked = centre.mass * centre.speed * centre.speed.abs()
-    rows = (torch.ones_like(braked), brakings.motion.x_dot, centre.reach + centre.offset, braked)
+    x_dot = brakings.motion.x_dot
+    rows = (torch.ones_like(x_dot), x_dot, centre.reach + centre.offset, centre.braked)
     terms, way = torch.stack(rows).double().numpy(), brakings.way.double().numpy()
     way = np.minimum(way, 1e3)  # only which side of the bound they are on matters
     shares = max(1 - quantile, 1 / len(way)) * terms.sum(1)  # all of them would leave the numbers open
