@@ -12,8 +12,8 @@ from operations import AWKWARD, OPERATIONS, PAIRS
 from torch import Tensor
 
 from cartpole_rl.choices import choice
-from cartpole_rl.envs.perception import Previous, perceive, perceive_first
-from cartpole_rl.envs.settings import ObservationSettings, TrackGuard
+from cartpole_rl.envs.perception import Previous, guarded, perceive, perceive_first
+from cartpole_rl.envs.settings import GuardedPole, ObservationSettings, TrackGuard
 from cartpole_rl.physics.actuator import ACTUATORS
 from cartpole_rl.physics.friction import CART_FRICTIONS, POLE_FRICTIONS
 from cartpole_rl.physics.models import INTEGRATORS, Models
@@ -22,7 +22,7 @@ from cartpole_rl.plants.simulated import Carts, Inputs, run_carts
 from cartpole_rl.plants.specs import PlantOutput
 from cartpole_rl.rig.hardware import nominal_encoders
 from cartpole_rl.scalar import Scalar, plain
-from cartpole_rl.tasks.features import ObservationKind
+from cartpole_rl.tasks.features import Measured, ObservationKind
 from cartpole_rl.tasks.rewards import Reward
 from cartpole_rl.tasks.settings import RewardSettings, TaskSettings
 
@@ -136,6 +136,21 @@ def test_physics_is_that_of_many_carts(models: Models) -> None:
     carts = Carts(drawn(len(CartParameters.names()), 0.01, 2), drawn(4, -8, 8, (0.0, math.nan)), drive)
     noise = torch.tensor([[0.5], [1.0], [-1.0]]).expand(3, CARTS)
     check(run, carts, Inputs(torch.randint(-255, 256, (1, CARTS)), noise))
+
+
+POLES = [GuardedPole(swing=0.8, density=0.4, length=length) for length in (0.6, None)]
+GUARDS = [GUARD.model_copy(update={"pole": pole}) for pole in POLES]
+
+
+@pytest.mark.parametrize("guard", [*GUARDS, GUARDS[0].model_copy(update={"also": GUARDS[1]})])
+def test_a_guard_that_knows_the_pole_is_that_of_many_carts(guard: TrackGuard) -> None:
+    def direction(given: tuple[Tensor, ...]) -> tuple[Tensor]:
+        states, length, track_end = given
+        return (guarded(Measured(*states), track_end, length, guard),)
+
+    given = drawn(4, -1, 1), drawn(1, 0.1, 2, (math.nan, math.inf)), drawn(1, 0.4, 0.4, (math.inf,))
+    assert set(direction(given)[0][0].tolist()) == {-1, 0, 1}
+    check(direction, given)
 
 
 OBSERVED = itertools.product(ObservationKind, range(3))  # with some of the past

@@ -142,9 +142,10 @@ def cut_judging(
         if np.ptp(piece.positions[:, 0]) >= moving
     ]
     if not pieces:
+        held = f"moves the cart over {moving:g} m within" if moving else "holds"
         raise RecordingError(
-            f"the cart never moves for {seconds:g} s without a lost frame: give longer recordings, drive it "
-            "more, or check the cable"
+            f"no recording {held} {seconds:g} s without a lost frame: record longer"
+            f"{', drive it more' if moving else ''}, or check the cable"
         )
     return joined(pieces[(JUDGING - 1) % len(pieces) :: JUDGING])._replace(lead=lead)
 

@@ -86,6 +86,7 @@ UNIDENTIFIABLE = {  # randomized about the identified cart, since no experiment 
     "latency_jitter": {"distribution": "uniform", "absolute": [0.0, 0.002]},
 }
 WIDEN = 2.0  # factor on the standard deviations, for carts to train on
+OF_MATCHING = ("friction_laws", "windows", "substeps", "carts")  # settings that method=one_step does not read
 BY_HAND = ("pole_mass", "pole_com")  # `unknowns.WEIGHED` as parameters: measured with scales and a ruler
 MOTOR = 200  # motor value of the force that is compared; coefficients of a curve are not comparable
 FINE = "actions/nine_levels_fine"  # for carts whose force starts at small motor values
@@ -109,6 +110,9 @@ def identify_cart(config: IdentifyConfig, folder: Path, words: Sequence[str] | N
     use_threads(config.threads)
     if words is not None:
         config = as_recorded(config, words)
+        unread = [name for name in OF_MATCHING if is_given([name], words)]
+        if config.method == "one_step" and unread:
+            print_message("identify", f"note: method=one_step does not read {', '.join(unread)}")
     nominal = config.nominal  # or ConfigError, before the cart moves
     note_other_numbers("identify", config.nominal_cart, [config.pole.nominal])
     source = config.source or folder

@@ -101,8 +101,9 @@ def test_recordings_of_a_run_are_of_its_cart_and_its_pole(
         assert {name: used[name] for name in taken} == taken
         assert ("pole" in taken) == (used["pole"] == recorded["pole"])
         assert f"note: {' and '.join(taken)} as in from=first" in capsys.readouterr().err
-    done = in_process("identify", *words, "method=one_step", "hydra.run.dir=run", folder=tmp_path)
+    done = in_process("identify", *words, "method=one_step", "carts=9", "hydra.run.dir=run", folder=tmp_path)
     assert done.code == 0, done.err
+    assert "note: method=one_step does not read carts\n" in done.err
     assert yaml.safe_load((tmp_path / "run/config.yaml").read_text())["cart"] == changed
 
 

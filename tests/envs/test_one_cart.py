@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
-from cartpole_rl.envs.settings import TrackGuard
+from cartpole_rl.envs.settings import GuardedPole, TrackGuard
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.plants.recorded import RecordedPlant
 from cartpole_rl.plants.serial.plant import emulated_plant
@@ -21,6 +21,7 @@ from cartpole_rl.tasks.settings import NO_ACTION
 
 Simulated = Callable[..., CartPoleEnv]
 GUARD = TrackGuard(margin=0.05, delay=0.1, deceleration=3.0)
+KNOWING = GUARD.model_copy(update={"pole": GuardedPole(swing=0.8, density=0.4)})
 NOISY = {"latency_jitter": Range(absolute=(0.001, 0.01)), "angle_noise": Range(absolute=(1e-4, 1e-3))}
 OBSERVATIONS: tuple[dict[str, Any], ...] = (
     {"pole_length": True},
@@ -67,7 +68,7 @@ def same(percept: Any, present: TensorDictBase, *keys: str) -> None:
 
 @pytest.mark.parametrize(
     ("observation", "guard"),
-    zip(OBSERVATIONS, (GUARD, None, GUARD), strict=True),
+    zip(OBSERVATIONS, (KNOWING, None, GUARD), strict=True),
     ids=["history", "raw", "positions"],
 )
 def test_a_simulated_cart(
