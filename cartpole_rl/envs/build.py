@@ -121,11 +121,9 @@ def simulated_env(
     return environment(config, plant.build(config, draws, carts, start, seed, compiled, device))
 
 
-def driven_carts(
-    config: CartPoleSettings, plant: SimulationSettings, device: torch.device | str = "cpu"
-) -> tuple[Draws, Models]:
+def driven_carts(config: CartPoleSettings, plant: SimulationSettings) -> tuple[Draws, Models]:
     """Return the source of the carts on `plant`, and what moves them. Raises CheckpointError, ConfigError."""
-    draws = randomizer(config, device)
+    draws = randomizer(config)
     if not isinstance(plant, LearnedSettings):
         return draws, config.models(plant)
     model, draws = model_and_carts(plant, config, draws)
