@@ -38,6 +38,7 @@ from cartpole_rl.identification.windows import Windows, lead_periods
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.physics.residual import Residual
 from cartpole_rl.rig.hardware import LARGEST_MOTOR
+from cartpole_rl.tasks.episode import wrap
 
 REFRESHING = 2  # matching steps in each refresh after the first
 BACKGROUND = 256  # random motions per update
@@ -86,6 +87,7 @@ class Ensemble:
         guess = first_guess(self.positions, dynamics.period)
         self.initial = InitialStates(guess.unsqueeze(1).repeat(1, members, 1), torch.empty(0))
         self.best = self.residual
+        self.allowed: float | None = None  # share of the errors within the spreads; None without spreads
         self.lowest = torch.full((members,), torch.inf, dtype=torch.float64)
         self.history: list[list[float]] = []  # loss of each member on the windows left out, at each refresh
         self.updates: list[int] = []  # at each refresh
@@ -124,10 +126,18 @@ class Ensemble:
         """
         near, far = 1.0, WIDEST
         adds = self.best.places.any() or self.best.last.any()
-        if adds and self.settings.members > 1 and self.covered(near, longer) < SHARE:
+        if not adds or self.settings.members == 1:
+            return self.best
+        self.allowed = self.covered(near, longer)
+        if self.allowed < SHARE:
+            self.allowed = self.covered(far, longer)
             for _ in range(HALVINGS):
                 middle = (near + far) / 2
-                near, far = (near, middle) if self.covered(middle, longer) >= SHARE else (middle, far)
+                share = self.covered(middle, longer)
+                if share >= SHARE:
+                    far, self.allowed = middle, share
+                else:
+                    near = middle
             self.best = self.best._replace(widening=torch.tensor(far, dtype=torch.float64))
         return self.best
 
@@ -194,6 +204,7 @@ def within_spreads(windows: Windows, dynamics: Dynamics, residual: Residual) -> 
     _, errors = predicted_by_members(windows, dynamics, residual)
     errors = errors[1:]
     spread = errors.std(2, ddof=1, keepdims=True)
+    errors[:, 1] = wrap(errors[:, 1])
     rounding = finest_scale(windows.resolution).numpy().reshape(1, 2, 1, 1)
     return np.asarray(np.abs(errors) <= CERTAIN * np.sqrt(2 * spread**2 + rounding**2))
 

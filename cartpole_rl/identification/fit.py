@@ -48,7 +48,7 @@ STARTS: tuple[Mapping[str, float], ...] = (  # points to search from; an unknown
     {"latency": -0.7, "motor_time_constant": 1.5},
 )
 SCREENING = 4  # iterations from each start
-HOPELESS = np.array([1.0, math.pi])  # m, rad: RMS errors of no cart
+HOPELESS = np.array([1.0, math.pi])  # m, rad: residuals of no cart
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Fit:
     point: Array  # [U], in standard deviations before measurement
     covariance: Array  # [U, U] of `point`
     nominal: dict[str, float]
-    rms: Array  # [2] m, rad: robust spread of the residuals of cart and pole
+    spread: Array  # [2] m, rad: of the residuals of cart and pole, 1.48 times their median size
     correlation: Array  # [2] of each residual with the next one in its window
     cost: float
 
@@ -95,7 +95,7 @@ def best_fit(
     """
     fits = [(fit_cart(windows, nominal, models, period, substeps), models) for models in candidates]
     fit, chosen = min(fits, key=lambda each: each[0].cost)
-    if (fit.rms > HOPELESS).any():
+    if (fit.spread > HOPELESS).any():
         raise RecordingError(NO_CART)
     return replace(fit, covariance=within_prior(fit.covariance)), chosen
 

@@ -26,6 +26,7 @@ from cartpole_rl.tasks.episode import Ending, Episode
 
 Array = NDArray[np.floating]
 HORIZON = 1.0  # s of motion, predicted
+FEW = 5  # stretches whose median is no error to rely on
 MOVING = 0.02  # m in that time, from which a friction model shows
 COARSE_STEPS = 4  # integration steps a period when friction models are compared
 CONTENDS = 1.5  # a screened model stays a candidate up to this multiple of the best one's error
@@ -57,6 +58,8 @@ class PredictionError(NamedTuple):
 
     x: float  # m
     theta: float  # rad
+    away: int = 0  # stretches away from upright; where there are none, it is the median of all
+    stretches: int = 0
 
     @property
     def size(self) -> float:
@@ -141,7 +144,7 @@ def identify(
             known=WEIGHED,
             extra_latency=half_step,  # (3.8) moves a cart half a step early
             near=near,
-            sizes=None if near is None else first.fit.rms,
+            sizes=None if near is None else first.fit.spread,
             on_step=on_step,
         )
         dynamics = Dynamics.of(fit.parameters, under, period, steps, half_step)
@@ -187,13 +190,14 @@ def judged(
     """
     explained = check_explained(fitted, dynamics, HORIZON)
     replays = check_explained(held_out, dynamics, HORIZON)
-    doubts = [
-        *early_endings([*fitted.values(), *held_out.values()]),
-        *warnings(fit, next(iter(fitted.values())).encoders),
-    ]
     motion = zip(*((each.x_error, each.theta_error, each.theta) for each in replays), strict=True)
     x_error, theta_error, theta = map(np.concatenate, motion)
     error = median_error(x_error, theta_error, theta, np.isfinite(x_error).all(1))
+    doubts = [
+        *early_endings([*fitted.values(), *held_out.values()]),
+        *warnings(fit, next(iter(fitted.values())).encoders),
+        *hardly_judged(error),
+    ]
     return Identification(fit, dynamics, candidates, explained, replays, error, doubts)
 
 
@@ -207,13 +211,23 @@ def median_error(
     away = whole & is_away(theta - theta_error)
     kept = away if away.any() else whole
     sizes = (np.sqrt((each[kept] ** 2).mean(1)) for each in (x_error, theta_error))
-    return PredictionError(*(float(np.median(each)) for each in sizes))
+    return PredictionError(*(float(np.median(each)) for each in sizes), int(away.sum()), int(whole.sum()))
 
 
 def early_endings(episodes: Sequence[Episode]) -> list[str]:
     """Return a warning if the cart or its link ended recordings early."""
     cut = [each.ended_by for each in episodes if each.ended_by in (Ending.LINK, Ending.FAULT)]
     return [f"{len(cut)} of the recordings ended early, by {' and '.join(sorted({*cut}))}"] if cut else []
+
+
+def hardly_judged(error: PredictionError) -> list[str]:
+    """Return a warning if the error is that of few stretches away from upright."""
+    if error.away >= FEW:
+        return []
+    return [
+        f"{error.away} of {error.stretches} held-out seconds are away from upright: the prediction error is "
+        "uncertain; record more motion with the pole away from upright"
+    ]
 
 
 def widened(fit: Fit, best: Candidate, candidates: Sequence[Candidate]) -> Fit:
@@ -254,9 +268,9 @@ def warnings(fit: Fit, encoders: Encoders) -> list[str]:
             )
         if left > UNINFORMED and abs(point) < 1 and np.isfinite(unknown.prior.unusual):
             found.append(f"the recordings hardly show {unknown.name}: its value is uncertain")
-    texts = f"{1e3 * fit.rms[0]:.2g} mm", f"{np.degrees(fit.rms[1]):.2g} deg"
+    texts = f"{1e3 * fit.spread[0]:.2g} mm", f"{np.degrees(fit.spread[1]):.2g} deg"
     for name, rms, size, correlation, text in zip(
-        ("cart", "pole"), fit.rms, encoders.resolution, fit.correlation, texts, strict=True
+        ("cart", "pole"), fit.spread, encoders.resolution, fit.correlation, texts, strict=True
     ):
         if rms > ROUNDING * size and correlation > CORRELATED:
             found.append(

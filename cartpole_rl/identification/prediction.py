@@ -43,13 +43,18 @@ def predict(windows: Windows, dynamics: Dynamics, residual: Residual | None = No
     if residual is not None and residual.widening != 1:
         _, apart = predicted_by_members(windows, dynamics, residual)
     spread = apart.std(2, ddof=1) if apart.shape[2] > 1 else np.zeros_like(apart[:, :, 0])
-    return Prediction(simulated.mean(2), error.mean(2), spread)
+    mean = error.mean(2)
+    mean[:, 1] = wrap(mean[:, 1])
+    return Prediction(simulated.mean(2), mean, spread)
 
 
 def predicted_by_members(
     windows: Windows, dynamics: Dynamics, residual: Residual | None = None
 ) -> tuple[Array, Array]:
-    """Return the motion that each member predicts after the lead, and its error, [H + 1, 2, M, W] each."""
+    """Return the motion that each member predicts after the lead, and its error, [H + 1, 2, M, W] each.
+
+    The angle's error of the first member is wrapped, and each other one is the nearest to that.
+    """
     lead, motors = windows.lead, torch.from_numpy(windows.motors)
     history = len(motors) - windows.periods
     positions = torch.from_numpy(windows.positions[: lead + 1])
@@ -60,7 +65,8 @@ def predicted_by_members(
     measured = windows.positions[lead:, :, None]
     simulated = np.where(np.isnan(measured), np.nan, predicted)
     error = simulated - measured
-    error[:, 1] = wrap(error[:, 1])
+    first_angle = wrap(error[:, 1, :1])
+    error[:, 1] = first_angle + wrap(error[:, 1] - first_angle)
     return simulated, error
 
 

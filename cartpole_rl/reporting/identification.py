@@ -68,8 +68,11 @@ def quantities_table(quantities: Sequence[Quantity]) -> str:
 
 
 def error_text(error: PredictionError) -> str:
-    """Return the errors of a prediction with their units."""
-    return f"{1e3 * error.x:.2f} mm and {math.degrees(error.theta):.2f} deg"
+    """Return the errors of a prediction with their units, and of which seconds they are the median."""
+    size = f"{1e3 * error.x:.2f} mm and {math.degrees(error.theta):.2f} deg"
+    if not error.away:
+        return f"{size}, the median of {error.stretches} seconds, none of them away from upright"
+    return f"{size}, the median of the {error.away} of {error.stretches} seconds away from upright"
 
 
 def identification_figures(
@@ -103,8 +106,8 @@ def identification_page(
     """Return the HTML page of an identification, which shows the figures of CAPTIONS in figures/."""
     title = "Identification of a cart"
     errors = (
-        "The table's errors are those over seconds of the recordings that were left out of these fits. "
-        "RMS prediction error over one second of held-out motion away from upright, with the best model: "
+        "The table's errors are medians over seconds of the recordings that were left out of these fits. "
+        "RMS prediction error over one second of held-out motion, with the best model: "
         f"{error_text(found.error)}."
     )
     warnings = "".join(f"<li>{escaped(each)}</li>" for each in found.warnings or ["None."])

@@ -338,8 +338,8 @@ class CartLearner:
         poles = self.training.pole if self.config.plant.reads_emulator else self.settings.pole
         fit, models = best_fit(windows, self.training.nominal_with(poles.nominal), self.candidates, period)
         self.show(
-            f"simulator fitted to {windows.number} windows of {windows.periods * period:g} s: RMS error "
-            f"{1e3 * fit.rms[0]:.2f} mm and {math.degrees(fit.rms[1]):.2f} deg"
+            f"simulator fitted to {windows.number} windows of {windows.periods * period:g} s: typical error "
+            f"{1e3 * fit.spread[0]:.2f} mm and {math.degrees(fit.spread[1]):.2f} deg"
         )
         self.candidates = [models]
         random = np.random.default_rng(self.config.seed)

@@ -87,6 +87,7 @@ UNIDENTIFIABLE = {  # randomized about the identified cart, since no experiment 
 }
 WIDEN = 2.0  # factor on the standard deviations, for carts to train on
 OF_MATCHING = ("friction_laws", "windows", "substeps", "carts")  # settings that method=one_step does not read
+JUDGED = 4096  # carts of the posterior, at least, that give intervals and standard errors
 BY_HAND = ("pole_mass", "pole_com")  # `unknowns.WEIGHED` as parameters: measured with scales and a ruler
 MOTOR = 200  # motor value of the force that is compared; coefficients of a curve are not comparable
 FINE = "actions/nine_levels_fine"  # for carts whose force starts at small motor values
@@ -162,8 +163,8 @@ def identify_cart(config: IdentifyConfig, folder: Path, words: Sequence[str] | N
             by_file, held_out_by_file, nominal, models, period, substeps, config.windows, laws, bar.update
         )
     with waiting("writing the results"):
-        carts = found.fit.draw(config.carts, np.random.default_rng(config.seed))
-        write_choices(found, carts, folder, config.hardware)
+        carts = found.fit.draw(max(config.carts, JUDGED), np.random.default_rng(config.seed))
+        write_choices(found, carts, config.carts, folder, config.hardware)
         write_json(folder / IDENTIFIED, results(found, carts) | errors(found.fit.parameters, truth, BY_HAND))
         for name, figure in identification_figures(found, carts, fitted, held_out).items():
             save(figure, folder / FIGURES / f"{name}.png")
@@ -305,8 +306,8 @@ def next_command(found: Identification, folder: Path) -> str:
 def print_verdict(found: Identification, folder: Path) -> None:
     """Print the prediction error, the warnings and the next command."""
     print(
-        f"RMS prediction error over one second of held-out motion: {error_text(found.error)}, with "
-        f"cart_friction={found.models.cart_friction}"
+        "RMS prediction error over one second of held-out motion, with "
+        f"cart_friction={found.models.cart_friction}: {error_text(found.error)}"
     )
     for warning in found.warnings:
         print(f"warning: {warning}")
@@ -314,10 +315,12 @@ def print_verdict(found: Identification, folder: Path) -> None:
     print_results(folder, files, next_command(found, folder))
 
 
-def write_choices(found: Identification, carts: np.ndarray, folder: Path, hardware: Hardware) -> None:
+def write_choices(
+    found: Identification, carts: np.ndarray, count: int, folder: Path, hardware: Hardware
+) -> None:
     """Write cart.yaml, pole.yaml, randomization.yaml and posterior.npz into `folder`.
 
-    `carts` [P, N] are drawn from the fit.
+    `carts` [P, N] are drawn from the fit; the first `count` are to train on.
     """
     write_cart(found, carts, folder / CART, hardware)
     for law in found.models[:2]:
@@ -331,7 +334,7 @@ def write_choices(found: Identification, carts: np.ndarray, folder: Path, hardwa
         np.savez(
             file,
             names=np.array(CartParameters.names()),
-            carts=carts,
+            carts=carts[:, :count],
             identified=np.array(identified_names(found)),
             unknowns=np.array([unknown.name for unknown in found.fit.unknowns]),
             point=found.fit.point,
@@ -407,8 +410,13 @@ def results(found: Identification, carts: np.ndarray) -> dict[str, Any]:
             each.cart_friction: {"x_m": each.error.x, "theta_rad": each.error.theta}
             for each in found.candidates
         },
-        "held_out_1_s": {"x_m": found.error.x, "theta_rad": found.error.theta},
-        "residual": {"x_m": float(found.fit.rms[0]), "theta_rad": float(found.fit.rms[1])},
+        "held_out_1_s": {
+            "x_m": found.error.x,
+            "theta_rad": found.error.theta,
+            "seconds": found.error.stretches,
+            "away_from_upright": found.error.away,
+        },
+        "residual": {"x_m": float(found.fit.spread[0]), "theta_rad": float(found.fit.spread[1])},
         "warnings": found.warnings,
     }
 

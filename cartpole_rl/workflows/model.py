@@ -19,7 +19,7 @@ from cartpole_rl.identification.checks import (
     check_same_encoders,
     shared_period,
 )
-from cartpole_rl.identification.ensemble import Ensemble
+from cartpole_rl.identification.ensemble import SHARE, Ensemble
 from cartpole_rl.identification.fit import Fit, best_fit
 from cartpole_rl.identification.identify import HORIZON
 from cartpole_rl.identification.prediction import CERTAIN, LEAD, REPORTED, errors_at, predict
@@ -118,7 +118,9 @@ def learn(episodes: Sequence[Episode], dynamics: Dynamics, fit: Fit, config: Mod
     lead = lead_periods(LEAD, dynamics.period)
     seconds = lead * dynamics.period + max(REPORTED_TIMES)
     longer = cut_windows(episodes, dynamics.period, seconds, config.windows)._replace(lead=lead)
-    ensemble = Ensemble(windows, dynamics, fit.rms, config.ensemble, config.seed, config.hardware.track_span)
+    ensemble = Ensemble(
+        windows, dynamics, fit.spread, config.ensemble, config.seed, config.hardware.track_span
+    )
     with progress_bar(config.ensemble.updates, "updates") as progress, waiting("learning"):
 
         def show_progress(update: int, losses: list[float]) -> None:
@@ -127,7 +129,13 @@ def learn(episodes: Sequence[Episode], dynamics: Dynamics, fit: Fit, config: Mod
 
         ensemble.learn(show_progress)
     with waiting("calibrating"):
-        ensemble.calibrate(longer)
+        widening = float(ensemble.calibrate(longer).widening)
+    if ensemble.allowed is not None and ensemble.allowed < SHARE:
+        print(
+            f"warning: the members, moved apart {widening:g} times, allow {ensemble.allowed:.0%} of the "
+            f"errors, not {SHARE:.0%}: the model is less certain than its spreads say; record more, or give "
+            "more updates"
+        )
     return ensemble
 
 
@@ -140,10 +148,10 @@ def fit_physics(windows: Windows, config: ModelConfig, pole: Pole, period: float
         for each in FRICTION_MODELS
     ]
     fit, models = best_fit(windows, nominal, candidates, period, plant.substeps)
-    errors = f"{1e3 * fit.rms[0]:.2f} mm (cart) and {np.degrees(fit.rms[1]):.2f} deg (pole)"
+    errors = f"{1e3 * fit.spread[0]:.2f} mm (cart) and {np.degrees(fit.spread[1]):.2f} deg (pole)"
     print(
-        f"physics with cart_friction={models.cart_friction}: RMS error {errors} over "
-        f"{windows.number} windows of {windows.periods * period:g} s"
+        f"physics with cart_friction={models.cart_friction}: typical error {errors} over "
+        f"{windows.number} windows of {windows.periods * period:g} s (1.48 times the median)"
     )
     return fit, models
 
@@ -163,6 +171,7 @@ def results(
         "learned_from_windows": int((~ensemble.left_out).any(0).sum()),
         "held_out_windows": held_out.number,
         "widening": float(model.residual.widening),
+        "within_spreads": ensemble.allowed,
         "cart_friction": str(model.models.cart_friction),
         "parameters": model.parameters,
         "errors": errors,

@@ -124,6 +124,11 @@ def test_an_effect_that_the_physics_lacks_is_learned(
     assert as_learned["rms_x_mm"] == learned["rms_x_mm"]
     ends = within_spreads(longer, dynamics, residual.not_widened())[-1].mean((1, 2))
     assert ensemble.covered(1.0, longer) <= ends.min() < ensemble.covered(float(residual.widening), longer)
+    assert ensemble.allowed == ensemble.covered(float(residual.widening), longer)
+    turned = held_out.positions.copy()
+    turned[held_out.lead + 1 :, 1] += np.pi  # so that the members' errors lie on both sides of half a turn
+    after_half_a_turn = predict(held_out._replace(positions=turned), dynamics, residual).spread
+    assert after_half_a_turn == pytest.approx(predict(held_out, dynamics, residual).spread, nan_ok=True)
     assert learned["within_x_mm"] > 0.6
     assert physics["rms_spread_x_mm"] == 0
     assert min(ensemble.history[0]) > max(min(each) for each in zip(*ensemble.history, strict=True))

@@ -30,7 +30,7 @@ def write(models: Models, nominal: dict[str, float], folder: Path) -> dict[str, 
     dynamics = Dynamics.of(fit.parameters, models, 0.02, 4)
     error = PredictionError(1e-3, 0.01)
     found = Identification(fit, dynamics, [Candidate(fit, dynamics, error)], [], [], error, [])
-    write_choices(found, fit.draw(10, np.random.default_rng(0)), folder, HARDWARE)
+    write_choices(found, fit.draw(20, np.random.default_rng(0)), 10, folder, HARDWARE)
     of_cart = {name: value for name, value in fit.parameters.items() if name not in Pole.model_fields}
     return {**of_cart, **HARDWARE.model_dump()}
 
