@@ -13,12 +13,15 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 from cartpole_rl.errors import FaultError, PlantError
+from cartpole_rl.plants.measured import BlindMotion
 from cartpole_rl.plants.serial.cart import RESTARTED, SerialCart
 from cartpole_rl.plants.serial.errors import NotReadyError, check_limits, check_period, check_rig
 from cartpole_rl.plants.serial.moves import (
+    BLIND,
     LEFT,
     NO_MOTION,
     RIGHT,
+    SURELY,
     ArmedCart,
     centre,
     gentle_motor,
@@ -142,13 +145,16 @@ class Probe(ArmedCart):
         """Raise the motor value to one side until the cart moves.
 
         Returns the size of that value, and the states before and after the move. Raises NotReadyError if the
-        cart never moves.
+        count never changes, or must have changed by then.
         """
         before, largest, moved = self.settle(), gentle_motor(self.hardware), self.cart_counts(MOVED)
+        blind = BlindMotion(self.hardware, SURELY * self.hardware.breakaway_motor)
         for size in range(RAMP_STEP, largest + 1, RAMP_STEP):
             after = self.drive(side * size)
             if abs(after.cart_counts - before.cart_counts) >= moved:
                 return size, before, after
+            if blind.is_seen(side * size, after.cart_counts, self.period):
+                raise NotReadyError(*BLIND)
         raise NotReadyError(f"motor values up to {side * largest:+d} do not move the cart's count", NO_MOTION)
 
     def centre(self) -> None:

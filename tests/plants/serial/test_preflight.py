@@ -1,9 +1,11 @@
 """The checks of a cart, on the emulated one: a good one, wires the wrong way round, and other faults."""
 
+import json
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -159,20 +161,32 @@ def test_a_pole_encoder_the_wrong_way_round(emulated: EmulatedCart, signs: dict[
 def test_a_motor_without_power(probe: Probe, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = probe.cart.set_motor
     monkeypatch.setattr(probe.cart, "set_motor", lambda value: asked(0))
-    with pytest.raises(NotReadyError, match=r"up to \+199 do not move .*switch the motor's supply on"):
+    with pytest.raises(
+        NotReadyError, match=r"the motor pushes, but .* does not change: switch the motor's supply on"
+    ):
         cart_direction(probe)
 
 
 def test_a_cart_that_hardly_moves() -> None:
-    with (
-        EmulatedCart(fast(**{**TRUTH, "deadband_left": 170.0})) as stiff,
-        SerialCart(patient(stiff.port)) as cart,
-    ):
+    rough = nominal_hardware().model_copy(update={"moving_friction": 1.5})  # as its file says
+    truth = {**TRUTH, "deadband_left": 170.0, "hardware": rough.model_dump()}
+    with EmulatedCart(fast(**truth)) as stiff, SerialCart(patient(stiff.port), rough) as cart:
         cart.home()
         probe = Probe(cart)
         cart_direction(probe)
         with pytest.raises(NotReadyError, match=r"-17\d left: clean the track"):
             deadband(probe)
+
+
+@pytest.mark.parametrize("moment", [28.6, 39.5])  # s: before the first ramp, and between two
+def test_a_count_that_froze_does_not_let_a_ramp_reach_the_stops(moment: float, tmp_path: Path) -> None:
+    journal = tmp_path / "journal"
+    with EmulatedCart(fast(stuck_encoder="cart", stuck_at=moment, journal=journal)) as emulated:
+        *_, last = findings(emulated.port)
+    assert last.words.startswith("the motor pushes, but the cart's count does not change")
+    lines = [json.loads(line) for line in journal.read_text().splitlines()]
+    started = next(line["us"] for line in lines if line.get("took") == "START")
+    assert not [line for line in lines if "touched" in line and line["us"] > started]
 
 
 def test_a_slow_motor(probe: Probe) -> None:
