@@ -14,7 +14,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import Compose, EnvBase, FrameSkipTransform, TransformedEnv
 
-from cartpole_rl.envs.hardware import HardwareTransform
+from cartpole_rl.envs.hardware import HardwareTransform, finite_actions
 from cartpole_rl.envs.perception import Percept, Previous
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.plants.specs import Numbers, Plant, PlantOutput, tensordict_of
@@ -128,9 +128,22 @@ class CartPoleEnv(TransformedEnv):
         """True if there is no transform but the hardware transform."""
         return isinstance(self.transform, HardwareTransform)
 
-    @cached_property
+    @property
     def one_cart(self) -> OneCart:
-        """The same environment on plain numbers, for a plant of one cart. Raises ConfigError."""
+        """The same environment on plain numbers, for a plant of one cart.
+
+        Raises ConfigError for several carts, and for further transforms, which it would leave out.
+        """
+        if not self._stands_alone:
+            further = [type(each).__name__ for each in self.transform if each is not self.hardware]
+            raise ConfigError(
+                f"an episode of one cart would leave out the environment's {', '.join(further)}: do their "
+                "work in the policy"
+            )
+        return self._one_cart
+
+    @cached_property
+    def _one_cart(self) -> OneCart:
         return OneCart(self.plant, self.hardware)
 
     def append_transform(self, transform: Any, *arguments: Any, **named: Any) -> EnvBase:
@@ -143,6 +156,7 @@ class CartPoleEnv(TransformedEnv):
 
     def step(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Step all carts; return `tensordict` with the outcome under "next". Nothing is checked."""
+        tensordict = self.with_finite_actions(tensordict)
         if not self._stands_alone or "_step" in tensordict:  # TorchRL skips a step if it masks all carts
             return super().step(tensordict)
         return tensordict.set("next", self._driven(tensordict))
@@ -152,6 +166,7 @@ class CartPoleEnv(TransformedEnv):
 
         Return `tensordict` with the outcome under "next", and the tensordict of the next step.
         """
+        tensordict = self.with_finite_actions(tensordict)
         if not self._stands_alone:
             return super().step_and_maybe_reset(tensordict)
         stepped = tensordict.set("next", self._driven(tensordict))
@@ -175,6 +190,13 @@ class CartPoleEnv(TransformedEnv):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         return self._driven(tensordict) if self._stands_alone else super()._step(tensordict)
+
+    def with_finite_actions(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Replace actions on numbers that are not finite by NO_ACTION, where the cart may be a real one."""
+        if self.plant.drives_one_cart:
+            numbers = (tensordict.get(key, None) for key in ("observation", "action_value"))
+            tensordict["action"] = finite_actions(tensordict.get("action"), *numbers)
+        return tensordict
 
     def _driven(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return the outcome of a step of the plant under the hardware transform alone."""

@@ -201,6 +201,17 @@ class HardwareTransform(Transform):
         return (ends if rows is None else ends[rows]).unsqueeze(0)
 
 
+def finite_actions(action: Tensor, *numbers: Tensor | None) -> Tensor:
+    """Return the actions [N]; NO_ACTION where a row of one of the `numbers` [N, K] is not finite.
+
+    The argmax of NaN values is the first action, full motor to the left.
+    """
+    for each in numbers:
+        if each is not None:
+            action = action.where(each.isfinite().all(-1), NO_ACTION)
+    return action
+
+
 def output_of(output: TensorDictBase) -> PlantOutput[Tensor]:
     """Return the frame in the output of a plant."""
     return PlantOutput(*(output.get(key).T for key in PlantOutput._fields))

@@ -20,8 +20,9 @@ from torch import Tensor
 from torchrl.modules import QValueActor
 
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv, OneCart
+from cartpole_rl.envs.hardware import finite_actions
 from cartpole_rl.envs.perception import Percept
-from cartpole_rl.errors import FaultError
+from cartpole_rl.errors import ConfigError, FaultError
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy
 from cartpole_rl.plants.measured import measured_part
 from cartpole_rl.plants.serial.plant import SerialPlant
@@ -125,15 +126,17 @@ def rehearse(cart: OneCart, policy: Policy) -> None:
 def choose(policy: Policy, current: TensorDictBase) -> Tensor:
     """Return the policy's actions [N]; NO_ACTION if the observation or an action value is not finite.
 
-    The argmax of NaN values is the first action, full motor to the left.
+    Raises ConfigError for actions that are no integers.
     """
     observed = current.select("observation")
-    finite = observed.get("observation").isfinite().all(-1)
+    numbers = observed.get("observation")
     chosen = policy(observed)
-    values = chosen.get("action_value", None)
-    if values is not None:
-        finite &= values.isfinite().all(-1)
-    return chosen.get("action").where(finite, NO_ACTION)
+    action = chosen.get("action")
+    if action.dtype not in (torch.int32, torch.int64):
+        raise ConfigError(
+            f"the policy gives actions of {action.dtype}: give the index of a motor value, int64"
+        )
+    return finite_actions(action, numbers, chosen.get("action_value", None))
 
 
 def run_batch(env: CartPoleEnv, policy: Policy, knocks: Knocks | None = None) -> list[Episode]:

@@ -1,18 +1,22 @@
 """One cart on plain numbers does what the TorchRL environment does over the same plant."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from tensordict import TensorDictBase
+from torchrl.envs import RewardSum
+from torchrl.modules import QValueActor
 
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.settings import GuardedPole, TrackGuard
-from cartpole_rl.evaluation.episodes import run_batch
+from cartpole_rl.errors import ConfigError
+from cartpole_rl.evaluation.episodes import run_batch, run_episodes
 from cartpole_rl.plants.recorded import RecordedPlant
 from cartpole_rl.plants.serial.plant import emulated_plant
 from cartpole_rl.plants.simulated import SimulatedPlant
@@ -120,6 +124,43 @@ def test_a_recorded_cart(simulated: Simulated, make_environment: Callable[..., C
     (episode,) = run_batch(env, lambda present: present.set("action", torch.tensor([2])))
     pair = [make_environment(RecordedPlant(episode, None), guard=GUARD) for _ in range(2)]
     assert compare(*pair, [2] * 500) == episode.steps
+
+
+@pytest.fixture
+def driven(make_environment: Callable[..., CartPoleEnv]) -> Iterator[CartPoleEnv]:
+    """The environment over an emulated cart."""
+    with closing(emulated_plant(EmulatorSettings(physics_step=1e-3))) as plant:
+        yield make_environment(plant, time_limit=5)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("further", [(), (RewardSum(),)], ids=["alone", "transformed"])
+def test_values_that_are_not_finite_stop_an_emulated_cart(
+    driven: CartPoleEnv, further: Sequence[Any]
+) -> None:
+    """In TorchRL's own loops; the argmax of NaN values is the first action, full motor to the left."""
+    for each in further:
+        driven.append_transform(each)
+    network = torch.nn.Linear(driven.observation_spec["observation"].shape[-1], 3)
+    network.weight.fill_(math.nan)
+    actor = QValueActor(network, in_keys=["observation"], spec=driven.action_spec_unbatched)
+    rolled = driven.rollout(5, actor)
+    assert rolled["action"].tolist() == [[NO_ACTION]]
+    assert rolled["next", "motor_applied"].tolist() == [[[0]]]
+    assert rolled["next", "truncated"].all()
+
+
+def test_an_action_that_is_no_integer_is_refused(driven: CartPoleEnv) -> None:
+    with pytest.raises(ConfigError, match=r"actions of torch.float32: give the index of a motor value"):
+        next(run_episodes(driven, lambda seen: seen.set("action", torch.tensor([1.9])), 1))
+
+
+def test_transforms_that_an_episode_would_leave_out_are_refused(driven: CartPoleEnv) -> None:
+    driven.append_transform(RewardSum())
+    with pytest.raises(
+        ConfigError, match="leave out the environment's RewardSum: do their work in the policy"
+    ):
+        next(run_episodes(driven, lambda seen: seen.set("action", torch.tensor([1])), 1))
 
 
 def test_an_emulated_cart(make_environment: Callable[..., CartPoleEnv]) -> None:
