@@ -202,16 +202,16 @@ def judged(
 
 
 def median_error(
-    x_error: Array, theta_error: Array, theta: Array, whole: NDArray[np.bool_]
+    x_error: Array, theta_error: Array, angle: Array, whole: NDArray[np.bool_]
 ) -> PredictionError:
     """Return the medians of the RMS errors of stretches, [S, T + 1], that are `whole` and away from upright.
 
-    If none is, those that are `whole` count. `theta` is simulated.
+    If none is, those that are `whole` count. `angle` is simulated.
     """
-    away = whole & is_away(theta - theta_error)
+    away = whole & is_away(angle - theta_error)
     kept = away if away.any() else whole
-    sizes = (np.sqrt((each[kept] ** 2).mean(1)) for each in (x_error, theta_error))
-    return PredictionError(*(float(np.median(each)) for each in sizes), int(away.sum()), int(whole.sum()))
+    x, theta = (float(np.median(np.sqrt((each[kept] ** 2).mean(1)))) for each in (x_error, theta_error))
+    return PredictionError(x, theta, int(away.sum()), int(whole.sum()))
 
 
 def early_endings(episodes: Sequence[Episode]) -> list[str]:

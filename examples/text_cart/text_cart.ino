@@ -51,9 +51,10 @@ bool motor_value(const char *text, unsigned length, int *motor) {
 void loop() {
     static char text[16];
     static unsigned length = 0;
-    static unsigned long measured_us = micros(), heard_ms = millis();
+    static unsigned long measured_us = micros(), heard_ms = millis(), byte_ms = millis();
     for (int bytes = 0; bytes < 64 && Serial.available() > 0; bytes++) { /* no stream of bytes stops the watchdog */
         char letter = (char)Serial.read();
+        byte_ms = millis();
         int motor;
         if (letter != '\n') {
             if (length < sizeof text) text[length++] = letter; /* a line that is too long is ignored */
@@ -69,6 +70,7 @@ void loop() {
         length = 0;
     }
     if (millis() - heard_ms > SILENCE_MS) drive(0); /* the watchdog */
+    if (length > 0 && millis() - byte_ms > SILENCE_MS) length = sizeof text; /* half a line: the rest is ignored, too */
     if (micros() - measured_us >= PERIOD_US) {
         measured_us += PERIOD_US;
         if (micros() - measured_us >= PERIOD_US) measured_us = micros(); /* late lines are left out */

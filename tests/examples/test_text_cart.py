@@ -3,6 +3,7 @@
 import os
 import shutil
 import subprocess
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -58,6 +59,14 @@ def test_it_drives_both_ways_and_stops_when_nobody_speaks(board: "subprocess.Pop
     tell(board, "-80\r\n")
     assert [said(board), said(board)] == [(RIGHT, 0), (LEFT, 80)]
     assert said(board) == (LEFT, 0)  # the watchdog
+
+
+def test_half_a_line_before_a_silence_is_no_motor_value(board: "subprocess.Popen[str]") -> None:
+    tell(board, "7\n25")
+    assert [said(board), said(board)] == [(RIGHT, 7), (RIGHT, 0)]  # the watchdog
+    time.sleep(0.01)  # a byte may be a millisecond younger than the line before it
+    tell(board, "5\n9\n")
+    assert said(board) == (RIGHT, 9)
 
 
 def test_bytes_without_end_do_not_stop_the_watchdog_and_measurements(program: Path, tmp_path: Path) -> None:

@@ -30,7 +30,7 @@ def main(text: str) -> int:
     bridge = Bridge(settings, hardware, driver, given["control_period"], given["lever_um"])
     RaiseOnce(lambda number: KeyboardInterrupt()).handle(signal.SIGINT, *ending_signals())
     try:
-        with open_link("auto") as link, bridge:
+        with bridge, open_link("auto") as link, bridge:  # ended twice: a signal may break the first end off
             bridge.listen()
             print(json.dumps({"port": link.port, "pid": os.getpid()}), file=answer, flush=True)
             take_precedence()

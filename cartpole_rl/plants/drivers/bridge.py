@@ -29,6 +29,7 @@ from cartpole_rl.emulator.link import Channel
 from cartpole_rl.errors import CartPoleError, ConfigError, LinkError, reason_of
 from cartpole_rl.plants.drivers.driver import Driver, Measurement, unwrapped
 from cartpole_rl.plants.drivers.potentiometer import Potentiometer
+from cartpole_rl.plants.serial.link import now
 from cartpole_rl.plants.settings import BoardSettings
 from cartpole_rl.rig.hardware import Hardware
 from cartpole_rl.signals import ending_signals
@@ -289,7 +290,7 @@ class Bridge:
         self._settings, self._hardware, self._driver = settings, hardware, driver
         self._lock, self._ending = Lock(), Event()
         self._failure: CartPoleError | None = None
-        self._booted = time.monotonic()
+        self._booted = now()
         self._control_period = control_period
         self._channel: Channel | None = None
         self._last: Measurement | None = None
@@ -308,6 +309,7 @@ class Bridge:
         self._measured = 0  # of the control period
         self._stops_left = STOPS  # whatever the board did before
         self._homing_stops = 0  # that a homing of the board needs yet, if it is broken off
+        self._is_stopped = False  # for good
 
     def listen(self) -> None:
         """Open and stop the board; learn how often it measures. Raises LinkError, PortError, ConfigError."""
@@ -324,7 +326,8 @@ class Bridge:
                 "middle: give metres from the middle, and the track in cart="
             )
         self._driver.open()
-        self._driver.stop()
+        for _ in range(STOPS):
+            self._driver.stop()
         board_us = self._learn_period()
         if not FASTEST_BOARD_US <= board_us <= LONGEST_US:
             raise LinkError(
@@ -651,11 +654,16 @@ class Bridge:
         return self
 
     def __exit__(self, kind: object, why: BaseException | None, traceback: object) -> None:
-        """Stop the board, whatever has happened; signals wait until then. Raises LinkError if it cannot."""
-        unstopped: Exception | None = None
-        self._ending.set()
+        """Stop the board, whatever has happened; signals wait until then. Raises LinkError if it cannot.
+
+        A signal in its first instructions may end it at once: whoever runs the bridge ends it twice.
+        """
+        if self._is_stopped:
+            return
         for number in (signal.SIGINT, *ending_signals()):
             signal.signal(number, signal.SIG_IGN)
+        unstopped: Exception | None = None
+        self._ending.set()
         free = self._lock.acquire(timeout=LONGEST_CALL)  # and not given back: nothing else may be sent
         self._failure = self._failure or LinkError("the bridge has ended")
         with suppress(Exception):
@@ -671,6 +679,7 @@ class Bridge:
                 unstopped = error
         with suppress(Exception):
             self._driver.close()
+        self._is_stopped = True
         if unstopped is not None and self._channel is not None:  # it was driven
             said = driver_error(self._settings, why if isinstance(why, Exception) else unstopped)
             raise LinkError(
@@ -707,7 +716,7 @@ class Bridge:
         return "nothing was received; check the cable, the power and plant.baud"
 
     def _now_us(self) -> int:
-        return int((time.monotonic() - self._booted) * 1e6)
+        return int((now() - self._booted) * 1e6)
 
 
 def longest_gap(arrived: int) -> int:

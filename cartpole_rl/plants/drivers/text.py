@@ -48,7 +48,7 @@ class TextDriver(Driver):
         self._pending = b""
         self._dropping = False  # until the next line: this one is too long
         self._queued_since: float | None = None  # when lines began to wait in the system's buffer
-        self._cut = False  # the last line was perhaps sent in part
+        self._cut = True  # the board may hold a part of a line
         self._ticks: int | None = None  # the newest time in the board's unit, unwrapped
         self.port = settings.port
 
@@ -56,7 +56,7 @@ class TextDriver(Driver):
         """Open the port. Raises PortError."""
         self.port = resolved_port(self.settings.port)
         self._line = open_port(self.port, self.settings.baud, self.settings.write_timeout)
-        self._pending, self._dropping = b"", False
+        self._pending, self._dropping, self._cut = b"", False, True
 
     def read(self, timeout: float) -> Measurement | None:
         """Return the next whole line as a measurement; None if none came within `timeout` s."""
@@ -114,7 +114,8 @@ class TextDriver(Driver):
         line, data = self._opened, text.encode() + b"\n"
         try:
             self._check_queue(line, FEW_LINES * len(data))
-            line.write(b"\n" + data if self._cut else data)
+            cut, self._cut = self._cut, True
+            line.write(b"\n" + data if cut else data)
             self._cut = False
         except OSError as error:
             raise LinkError(

@@ -20,7 +20,7 @@ from cartpole_rl.plants.drivers.driver import Driver, Measurement
 from cartpole_rl.plants.settings import DriverSettings
 from cartpole_rl.rig.hardware import Encoders, hardware_of
 from cartpole_rl.rig.parameters import completed
-from cartpole_rl.signals import until_stopped
+from cartpole_rl.signals import RaiseOnce, until_stopped
 from cartpole_rl.wire.frames import encode_frame
 from cartpole_rl.wire.messages import Fault, Flags, Home, Message, Stop
 
@@ -444,6 +444,21 @@ def test_a_driver_that_raises_anything_leaves_a_stopped_board() -> None:
     assert bridge.played.stops >= STOPS
 
 
+def test_a_signal_while_the_end_begins_leaves_a_stopped_board(monkeypatch: pytest.MonkeyPatch) -> None:
+    bridge, signals = Playing(sends="value", full=255), iter([signal.SIGTERM])
+
+    def ignore_first(number: int, handler: Any) -> None:
+        for late in signals:
+            signal.raise_signal(late)
+
+    bridge.played.script = [LinkError("cable")]
+    RaiseOnce(lambda number: KeyboardInterrupt()).handle(signal.SIGTERM)
+    monkeypatch.setattr("cartpole_rl.plants.drivers.bridge.signal.signal", ignore_first)
+    with pytest.raises(KeyboardInterrupt), bridge:
+        bridge.run_and_end()
+    assert bridge.played.stops >= STOPS
+
+
 def test_a_driver_that_returns_something_else_is_named() -> None:
     bridge = Playing()
     bridge.played.script = [(0, 0, 0)]
@@ -556,9 +571,9 @@ def test_a_board_is_stopped_before_anything_else() -> None:
     bridge = Playing()
     bridge.played.script = [Measurement(0, 0, PERIOD_US * number) for number in range(25)]
     bridge.listen()
-    assert bridge.played.stops == 1
+    assert bridge.played.stops == STOPS  # the first may be damaged
     bridge.measure(0, 0, 0, 0)
-    assert bridge.played.stops == 1 + STOPS
+    assert bridge.played.stops == 2 * STOPS
     assert not bridge.played.sent
 
 

@@ -146,14 +146,14 @@ def test_a_clock_of_32_bits_goes_on_when_it_wraps(line: Line) -> None:
 
 
 def test_it_sends_lines(line: Line) -> None:
-    line.driver.send(-12.4)
+    line.driver.send(-12.4)  # the first line ends half a one, of a host that died
     line.driver.stop()
-    assert line.sent(2) == b"-12\n0\n"
+    assert line.sent(3) == b"\n-12\n0\n"
     with closing(Line(line="a={:.2f}", stop_line="stop", home_line="home", homing="board")) as other:
         other.driver.send(1.234)
         other.driver.stop()
         other.driver.home()
-        assert other.sent(3) == b"a=1.23\nstop\nhome\n"
+        assert other.sent(4) == b"\na=1.23\nstop\nhome\n"
 
 
 def test_lines_that_wait_for_long_are_discarded_and_the_next_one_is_whole(
@@ -163,7 +163,7 @@ def test_lines_that_wait_for_long_are_discarded_and_the_next_one_is_whole(
     monkeypatch.setattr(type(line.driver._line), "out_waiting", property(lambda port: waiting))
     monkeypatch.setattr("cartpole_rl.plants.drivers.text.QUEUED", 60.0)
     line.driver.send(1)  # so many may wait for a moment
-    assert line.sent(1) == b"1\n"  # discarding may drop what the system has not handed over yet
+    assert line.sent(2) == b"\n1\n"  # discarding may drop what the system has not handed over yet
     monkeypatch.setattr("cartpole_rl.plants.drivers.text.QUEUED", -1.0)
     with pytest.raises(
         LinkError, match=r"takes lines more slowly than they are sent: .*now 115200, a higher"
@@ -172,6 +172,21 @@ def test_lines_that_wait_for_long_are_discarded_and_the_next_one_is_whole(
     waiting = 0
     line.driver.stop()
     assert line.sent(2) == b"\n0\n"
+
+
+def test_the_line_after_one_that_was_sent_in_part_is_whole(
+    line: Line, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def write_a_part(data: bytes) -> None:
+        os.write(line.driver._line.fd, data[:2])
+        raise OSError("write timeout")
+
+    line.driver.send(1)
+    with monkeypatch.context() as patched, pytest.raises(LinkError, match="takes no bytes any more"):
+        patched.setattr(line.driver._line, "write", write_a_part)
+        line.driver.send(253)
+    line.driver.stop()
+    assert line.sent(4) == b"\n1\n25\n0\n"
 
 
 def test_a_board_that_is_gone_is_a_lost_link(line: Line) -> None:
