@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cartpole_rl.errors import RecordingError
-from cartpole_rl.identification.checks import check_explained
+from cartpole_rl.identification.checks import check_explained, hardly_explained
 from cartpole_rl.identification.fit import Fit, fit_cart, within_prior
 from cartpole_rl.identification.prediction import LEAD, Replayed, is_away, predict
 from cartpole_rl.identification.rollout import Dynamics
@@ -197,6 +197,8 @@ def judged(
         *early_endings([*fitted.values(), *held_out.values()]),
         *warnings(fit, next(iter(fitted.values())).encoders),
         *hardly_judged(error),
+        *hardly_explained(fitted, explained, dynamics),
+        *hardly_explained(held_out, replays, dynamics),
     ]
     return Identification(fit, dynamics, candidates, explained, replays, error, doubts)
 

@@ -55,6 +55,7 @@ class Report(NamedTuple):
     gaps: int  # places where rows are missing
     saturated: int  # rows with full motor
     beyond: int  # rows with a motor value beyond full
+    strongest: float  # the largest motor value as a share of full
     leaps: int  # rows to which no pole turns from the row before
     leap: str  # the first of them
     wrap: float  # turns by which the angle jumps where its column wraps; 0 if it does not
@@ -184,6 +185,7 @@ def cut_log(read: Rows, layout: Layout, encoders: Encoders, period: float) -> Lo
         int((~regular).sum()),
         int((np.abs(motor) >= 0.999).sum()),
         int((np.abs(motor) > 1.001).sum()),
+        float(np.abs(motor).max()),
         len(leaps),
         f"row {read.places[leaps[0]]} of {path.name}" if len(leaps) else "",
         wrap_of(theta, together),

@@ -30,6 +30,7 @@ from cartpole_rl.identification.logs import (
     Rows,
     cut_log,
     read_rows,
+    signed,
     units_of_turn,
 )
 from cartpole_rl.identification.sensors import Estimate, Sensors, question_sensors
@@ -55,6 +56,7 @@ LATE = 0.05  # s, or two periods: a cart that takes longer is unusual
 RESAMPLED = 5e-4  # s between rows from which a log may be so fast
 LEAPS = 0.02  # share of rows; with a longer period than QUICK a pole may turn so far between two rows
 QUICK = 0.02 * (1 + SAME)  # s
+WEAK = 0.05  # share of the full motor value that a log surely goes beyond
 SATURATED, LACKING = 0.5, 0.25  # shares of rows: with full motor, and with an empty cell
 
 
@@ -220,6 +222,11 @@ def doubts(reports: Sequence[Report], sensors: Sensors, period: float, layout: L
     if beyond := sum(each.beyond for each in reports):
         full = f"layout.motor.full={layout.motor.full:g}"
         yield f"{beyond} of {rows} motor values are beyond {full}: give the largest"
+    if (strongest := max(each.strongest for each in reports)) < WEAK:
+        yield (
+            f"the largest motor value is {strongest * layout.motor.full:.3g}, and layout.motor.full="
+            f"{layout.motor.full:g}: in steps of a 255th little is left of it; give the motor's largest value"
+        )
     saturated = sum(each.saturated for each in reports)
     if saturated > SATURATED * rows:
         yield f"{saturated} of {rows} rows have full motor: the motor's curve cannot be told from them"
@@ -249,8 +256,11 @@ def wrong_wrap(reports: Sequence[Report], layout: Layout) -> str:
     """Return a sentence if the angle jumps by other than whole turns."""
     jump, turn, name = angle_jump(reports, layout), units_of_turn(layout), layout.angle.name
     turns = jump / turn
-    if not jump or abs(turns - max(1, round(turns))) <= WRAP:
+    if not jump:
         return ""
+    if abs(turns - max(1, round(turns))) <= WRAP:
+        advice = f"the angle jumps by {jump:.6g} where {name} wraps: give layout.angle.wraps=true"
+        return "" if layout.angle.wraps else advice
     said = f"the angle jumps by {jump:.6g} where {name} wraps, and a turn has {turn:.6g}: "
     for unit, size in TURN.items():
         if jump == size and not ALMOST < turns < 1 / ALMOST:
@@ -306,15 +316,23 @@ def _scale_doubts(sensors: Sensors, layout: Layout, jump: float) -> Iterator[str
             f"{turn / scale.low:.5g}), not {turn:.5g}: give it as layout.angle.unit{wraps}"
         )
     elif zero is not None and not zero.holds(0, ANGLE_ZERO):
+        value, low, high = recorded_angle(zero, layout)
         yield (
-            f"the pole is upright at a recorded angle of {np.degrees(zero.value):.1f} degrees (95 %: "
-            f"{np.degrees(zero.low):.1f} to {np.degrees(zero.high):.1f}): mend layout.angle.upright"
+            f"the pole is upright where {layout.angle.name} is {value:.5g} (95 %: {low:.5g} to {high:.5g}), "
+            f"not {layout.angle.upright:.5g}: give it as layout.angle.upright"
         )
     if position is not None and scale is not None and not position.holds(1, POSITION_SCALE):
         yield (
             f"the position's scale is refuted by the pole: the cart moves {_or_unit(position.value)} as far "
             f"as recorded (95 %: {position.low:.3g} to {position.high:.3g}): mend layout.position.unit"
         )
+
+
+def recorded_angle(angle: Estimate, layout: Layout) -> Estimate:
+    """Return an angle, rad to the right of the upright of `layout`, in the units of its column."""
+    factor = signed(layout.angle.positive) * units_of_turn(layout) / (2 * np.pi)
+    value, *ends = (layout.angle.upright + factor * each for each in angle)
+    return Estimate(value, *sorted(ends))
 
 
 def _or_unit(factor: float) -> str:
@@ -383,9 +401,10 @@ def print_summary(
         print(f"left out: {number} rows {reason}")
     if gaps := sum(each.gaps for each in reports):
         print(f"gaps: {gaps} between rows that are not one period apart")
+    zero = sensors.angle_zero and recorded_angle(sensors.angle_zero, config.layout)
     for name, estimate, factor, unit in (
         ("angle: true over recorded", sensors.angle_scale, 1, ""),
-        ("upright at a recorded angle of", sensors.angle_zero, 180 / np.pi, " degrees"),
+        (f"upright where {config.layout.angle.name} is", zero, 1, ""),
         ("position: true over recorded", sensors.position_scale, 1, ""),
         ("state to effect of its motor value", sensors.delay, 1e3, " ms"),
     ):

@@ -17,6 +17,7 @@ from cartpole_rl.identification.checks import (
     check_each,
     check_explained,
     check_same_encoders,
+    hardly_explained,
     shared_period,
 )
 from cartpole_rl.identification.ensemble import SHARE, Ensemble
@@ -76,7 +77,10 @@ def learn_model(config: ModelConfig, folder: Path) -> None:
     with waiting("fitting the physics"):
         fit, models = fit_physics(cut_windows(training, period), config, pole, period)
         dynamics = Dynamics.of(fit.parameters, models, period, LearnedSettings.substeps)
-        check_explained(by_file, dynamics, HORIZON)
+        replays = check_explained(by_file, dynamics, HORIZON)
+        doubts = hardly_explained(by_file, replays, dynamics)
+    for doubt in doubts:
+        print(f"warning: {doubt}")
     ensemble = learn(training, dynamics, fit, config)
     model = learned_model(fit, ensemble, config.hardware)
     physics = predict(windows, ensemble.dynamics)

@@ -4,6 +4,7 @@ The simulated cart is reset to the measured state every `restart` seconds: over 
 diverge.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -30,11 +31,11 @@ from cartpole_rl.reporting.texts import count_text
 from cartpole_rl.reporting.web_view import WebView
 from cartpole_rl.rig.hardware import nominal_hardware
 from cartpole_rl.rig.parameters import check_names, check_values
-from cartpole_rl.run_folder import FIGURES, program_of, recordings, write_config, write_json
+from cartpole_rl.run_folder import FIGURES, recorded_config, recordings, write_config, write_json
 from cartpole_rl.terminal import as_word, print_message, print_results, shown, words_given
 from cartpole_rl.workflows.build import recorded_cart
 from cartpole_rl.workflows.checks import note_other_numbers
-from cartpole_rl.workflows.config import ReplayConfig, TrainConfig, load_settings
+from cartpole_rl.workflows.config import ReplayConfig, TrainConfig, load_settings, recorded_settings
 from cartpole_rl.workflows.poles import chosen_pole
 
 REPLAY, FIGURE = "replay.json", f"{FIGURES}/replay.png"
@@ -51,7 +52,10 @@ def replay_recordings(config: ReplayConfig, folder: Path) -> None:
     paths = recordings(config.source)
     loaded = [read_recording(path) for path in paths]
     episodes = [each.episode for each in loaded]
-    settings = recorded_cart(paths) or load_settings(TrainConfig)
+    agent, note = recorded_cart(paths), ""
+    settings = agent or load_settings(TrainConfig)
+    if agent is None and config.cart is None:
+        config, note = with_recorded_cart(config, paths[0].parent.parent, settings.cart)
     given = {name: value for name in GROUPS if (value := getattr(config, name)) is not None}
     settings = settings.model_copy(update=given)
     by_file = {str(path): each for path, each in zip(paths, episodes, strict=True)}
@@ -81,9 +85,8 @@ def replay_recordings(config: ReplayConfig, folder: Path) -> None:
     count = count_text(len(episodes))
     subtitle = f"above: {paths[0].name},  below: {count},  pole={name}"
     save(replay_figure(replays, period, REPORTED_TIMES, "Measured and simulated", subtitle), folder / FIGURE)
-    if program_of(paths[0].parent.parent) is None and config.cart is None:
-        line = "note: without the config.yaml of their run the recordings tell no cart: this is cart=ip02"
-        print_message("replay", line)
+    if note:
+        print_message("replay", note)
     print(error_table({"": errors}, f"errors of {count}, pole={name}, over the time since a reset"))
     if away:
         print(error_table({"": away}, "the same away from upright; near it an error grows e times in 0.15 s"))
@@ -96,6 +99,25 @@ def replay_recordings(config: ReplayConfig, folder: Path) -> None:
         shown_episodes = [shown_beside(*pair, track) for pair in zip(paths, replays, strict=True)]
         with WebView(f"Replay of {paths[0].parent.parent.name}", pole.length, shown_episodes) as view:
             view.wait()
+
+
+def with_recorded_cart(
+    config: ReplayConfig, run: Path, usual: Mapping[str, float]
+) -> tuple[ReplayConfig, str]:
+    """Return `config` with the cart of an import or an identification, and a line for an unusual one.
+
+    Raises CheckpointError for a cart of another version.
+    """
+    cart = recorded_config(run).get("cart")
+    if cart is None:
+        return (
+            config,
+            "note: without the config.yaml of their run the recordings tell no cart: this is cart=ip02",
+        )
+    if cart == usual:
+        return config, ""
+    settings = {**config.model_dump(mode="json", by_alias=True), "cart": cart}
+    return recorded_settings(ReplayConfig, settings, f"from={run}"), f"note: cart as in from={run}"
 
 
 def shown_beside(path: Path, replayed: Replayed, track: float) -> dict[str, Any]:

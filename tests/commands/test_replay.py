@@ -9,6 +9,8 @@ import pytest
 import yaml
 from command_line import Outcome, in_process
 
+from cartpole_rl.choices import choice
+
 
 def replay(source: Path, folder: Path, *words: str) -> tuple[Outcome, dict[str, Any]]:
     done = in_process("replay", f"from={source}", *words, "hydra.run.dir=run", folder=folder)
@@ -50,6 +52,15 @@ def test_copied_recordings_tell_no_cart(recorded: Path, tmp_path: Path) -> None:
     shutil.copy(recorded / "recordings/episode_000.csv", tmp_path)
     done, _ = replay(tmp_path / "episode_000.csv", tmp_path)
     assert "tell no cart: this is cart=ip02" in done.err
+
+
+def test_the_cart_of_an_import_is_followed(recorded: Path, tmp_path: Path) -> None:
+    shutil.copytree(recorded / "recordings", tmp_path / "imported/recordings")
+    config = yaml.safe_dump({"cart": choice("cart/ip02") | {"cart_mass": 1.5}})
+    (tmp_path / "imported/config.yaml").write_text(config)
+    done, results = replay(Path("imported"), tmp_path)
+    assert "note: cart as in from=imported" in done.err
+    assert results["parameters"]["cart_mass"] == 1.5
 
 
 def test_the_cart_of_the_recorded_agent_is_followed(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from tensordict import TensorDict
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.envs.guard import stopping_distance
 from cartpole_rl.errors import ConfigError, RecordingError
-from cartpole_rl.identification.checks import check_explained, check_recordings, stays_up
+from cartpole_rl.identification.checks import check_explained, check_recordings, hardly_explained, stays_up
 from cartpole_rl.identification.experiments import (
     EXPERIMENTS,
     HELD_OUT,
@@ -486,6 +486,19 @@ def test_a_recording_that_no_such_cart_moves_like_is_refused(
     fitted = fitted | others if name in fitted else fitted
     with pytest.raises(RecordingError, match=rf"^{name}: no cart explains this recording: 1 s of the "):
         judged(found.fit, found.dynamics, found.candidates, fitted, held_out | others)
+
+
+def test_a_recording_that_is_too_short_to_be_refused_is_warned_of(
+    recordings: dict[str, Episode], found: Identification
+) -> None:
+    part = recordings[HELD_OUT].part(50, 95)
+    for motor, expected in ((part.motor, 0), (-part.motor, 1)):
+        recording = {"part": changed(part, motor=lambda _, given=motor: given)}
+        replays = check_explained(recording, found.dynamics, 1.0)
+        warned = hardly_explained(recording, replays, found.dynamics)
+        assert len(warned) == expected
+        start = "part: no cart explains this recording: 0.3 s of the "
+        assert all(each.startswith(start) for each in warned)
 
 
 def test_the_recording_of_which_the_cart_explains_least_is_named(

@@ -552,6 +552,10 @@ BROKEN: dict[str, tuple[Callable[[Columns], Columns], list[str]]] = {
         lambda each: {"a": -each["a"], "t": each["t"] + np.random.default_rng(2).uniform(0, 0.0035, STEPS)},
         ["angle.positive", "the time between rows varies"],
     ),
+    "a motor value of at most 1": (
+        lambda each: {"u": each["u"] / 255},
+        [r"^the largest motor value is (1|0\.\d+), and layout\.motor\.full=255: .* largest value$"],
+    ),
     "degrees": (lambda each: {"a": np.degrees(each["a"])}, ["may be in degrees"]),
     "radians, told as degrees": (lambda each: {"a": np.radians(each["a"])}, ["may be in radians"]),
     "degrees that wrap": (
@@ -568,7 +572,7 @@ BROKEN: dict[str, tuple[Callable[[Columns], Columns], list[str]]] = {
         ["750 of 1500 rows were left out, with an empty cell .* repeat its last value"],
     ),
     "scale of 4 %": (lambda each: {"a": 1.04 * each["a"]}, [r"0\.96\d times as far"]),
-    "zero": (lambda each: {"a": each["a"] + 0.06}, ["upright at a recorded angle of 3"]),
+    "zero": (lambda each: {"a": each["a"] + 0.06}, ["upright where a is 0.0[56]"]),
     "millimetres": (lambda each: {"x": 1e3 * each["x"]}, ["may be in mm"]),
     "hanging at 0": (lambda each: {"a": each["a"] - np.pi}, ["layout.angle.upright is half a turn"]),
     "hanging at 0, angle sign": (
@@ -610,6 +614,23 @@ def test_each_fault_of_a_log_is_a_doubt(
     alone = "time", "half a turn", "position.positive", "more often", "leaps"
     if any(each in expected[0] for each in alone):  # nothing else is wrong
         assert len(found) == len(expected)
+
+
+@pytest.mark.parametrize(("positive", "sign"), [("right", 1), ("left", -1)])
+def test_the_upright_is_told_in_the_column_s_own_units(
+    doubts: Doubts, motion: Columns, positive: str, sign: int
+) -> None:
+    column = {"name": "a", "unit": "deg", "positive": positive, "upright": 180.0}
+    (found,) = doubts({**motion, "a": 184 + sign * np.degrees(motion["a"])}, angle=column)
+    told = re.search(r"^the pole is upright where a is ([\d.]+) .*, not 180: give it as layout", found)
+    assert told is not None
+    assert float(told[1]) == pytest.approx(184, abs=0.5)
+
+
+def test_a_column_that_wraps_against_its_layout_is_told(doubts: Doubts, motion: Columns) -> None:
+    column = {"name": "a", "wraps": False}
+    (found,) = doubts({**motion, "a": wrap(motion["a"])}, angle=column)
+    assert found == "the angle jumps by 6.28319 where a wraps: give layout.angle.wraps=true"
 
 
 OF_BALANCED: dict[str, tuple[int, float, float, str]] = {
