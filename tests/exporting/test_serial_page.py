@@ -222,29 +222,53 @@ def test_another_version_of_the_protocol_is_refused(page: str, tmp_path: Path) -
 
 
 @needs_browser
+@pytest.mark.parametrize("quietly", [False, True], ids=["error", "end of the stream"])
+def test_a_pulled_cable_ends_it_with_one_line(page: str, tmp_path: Path, quietly: bool) -> None:
+    script = f"port.endsQuietly = {str(quietly).lower()}; {AGREED}{ENDED}"
+    with emulator() as host, bridged(page, script, host, tmp_path) as bridge:
+        end = time.monotonic() + SILENCE
+        while not written(bridge, Home) and time.monotonic() < end:
+            time.sleep(0.02)
+        host.process.terminate()  # the end of the emulator is that of its cable
+        host.process.wait(SILENCE)
+        line, *_ = bridge.report()
+        assert isinstance(frames(bridge.written)[-1].message, Stop)
+    assert line.startswith("The cable to the cart was pulled")
+    assert not written(bridge, Start)
+
+
+@needs_browser
 @pytest.mark.parametrize(
     ("trouble", "words"),
     [
-        ({}, "The cable to the cart was pulled"),
         ({"reset_at": 3.0}, "The cart has restarted"),
         ({"stuck_encoder": "cart"}, "The cart latched a fault"),
     ],
-    ids=["cable", "restart", "fault"],
+    ids=["restart", "fault"],
 )
 def test_trouble_ends_it_with_one_line(
     page: str, tmp_path: Path, trouble: dict[str, Any], words: str
 ) -> None:
-    with emulator(**trouble) as host, bridged(page, AGREED + ENDED, host, tmp_path) as bridge:
-        if not trouble:  # the end of the emulator is that of its cable
-            end = time.monotonic() + SILENCE
-            while not written(bridge, Home) and time.monotonic() < end:
-                time.sleep(0.02)
-            host.process.terminate()
-            host.process.wait(SILENCE)
-        line, *_ = bridge.report()
-        assert isinstance(frames(bridge.written)[-1].message, Stop)
+    line, bridge = answer(page, AGREED + ENDED, tmp_path, **trouble)
     assert line.startswith(words)
     assert not written(bridge, Start)
+
+
+@needs_browser
+@pytest.mark.parametrize("is_fatal", [False, True], ids=["passing", "fatal"])
+def test_a_failed_write_stops_the_cart_unless_its_cable_was_pulled(
+    page: str, tmp_path: Path, is_fatal: bool
+) -> None:
+    """A motor value fails, and the STOP after it."""
+    fail = f"""
+    await until(() => real.answered >= 20 || real.done);
+    Object.assign(port, {{ failures: 2, isFatal: {str(is_fatal).lower()} }});
+    """
+    line, _ = answer(page, DRIVEN + fail + ENDED, tmp_path, stopped=not is_fatal)
+    if is_fatal:
+        assert line.startswith("The cable to the cart was pulled")
+    else:
+        assert line == "The port took no bytes: check its cable, then connect again."
 
 
 @needs_browser

@@ -23,15 +23,28 @@ READ_SLICE = 0.05  # s
 PORT = """<script>
 class BridgedPort {
   readable = null;
+  failures = 0; // of the next writes
+  isFatal = false; // a failure: no other stream follows
+  endsQuietly = false; // the stream, when the cable is pulled
   async open(options) {
     this.options = options;
     const answer = await fetch("/read");
     const pulled = (control) => {
+      if (this.endsQuietly) return;
       this.readable = null;
       control.error(new DOMException("The device has been lost.", "NetworkError"));
     };
     this.readable = answer.body.pipeThrough(new TransformStream({ flush: pulled }));
-    const write = (bytes) => fetch("/write", { method: "POST", body: bytes });
+    this.renewWritable();
+  }
+  renewWritable() {
+    const write = async (bytes) => {
+      if (!this.failures) return fetch("/write", { method: "POST", body: bytes });
+      this.failures -= 1;
+      this.writable = null;
+      if (!this.isFatal) this.renewWritable();
+      throw new DOMException("The write failed.", this.isFatal ? "NetworkError" : "UnknownError");
+    };
     this.writable = new WritableStream({ write });
   }
   async setSignals(signals) { this.signals = signals; }

@@ -181,6 +181,7 @@ class SerialCart {
           for (const run of this.splitter.feed(part.value)) this.take(decodedFrame(run));
           this.wake();
         }
+        lost = true; // a stream that ends has no successor
       } catch (error) {
         lost = error.name === "NetworkError"; // after a damaged byte the port goes on with a new stream
       }
@@ -193,8 +194,17 @@ class SerialCart {
     this.sequence = (this.sequence + 1) & 0xff;
     const frame = encodedFrame(name, values, this.sequence);
     const bytes = name === "STOP" ? Uint8Array.of(0, ...frame) : frame; // 0x00 ends half a frame before it
-    this.writer.write(bytes).catch(() => this.end(LOST));
+    const writer = this.writer;
+    writer?.write(bytes).catch(() => this.renewWriter(writer));
     return this.sequence;
+  }
+
+  /** End it after an error of `writer`. The port then has a new stream, unless its cable was pulled. */
+  renewWriter(writer) {
+    if (this.closed || writer !== this.writer) return;
+    writer.releaseLock();
+    this.writer = this.port.writable?.getWriter();
+    this.end(this.writer ? "the port took no bytes: check its cable, then connect again" : LOST);
   }
 
   async close() {
