@@ -21,9 +21,10 @@ from cartpole_rl.envs.build import environment
 from cartpole_rl.plants.specs import Numbers, OneCartPlant, PlantOutput
 from cartpole_rl.rig.hardware import nominal_hardware
 from cartpole_rl.wire.frames import Frame
-from cartpole_rl.wire.messages import Flags, Hello, Home, Info, SetMotor, Start, State, Stop
+from cartpole_rl.wire.messages import Flags, Hello, Home, Info, Nack, Reason, SetMotor, Start, State, Stop
 from cartpole_rl.workflows.build import TrainedAgent, network_of
 
+FAR_AND_FAST = 4_400  # counts from the middle, where a pushed cart has 0.6 m/s
 VECTORS = json.loads(Path("tests/wire/vectors.json").read_text(encoding="utf-8"))
 
 AGREED = """
@@ -269,6 +270,43 @@ def test_a_failed_write_stops_the_cart_unless_its_cable_was_pulled(
         assert line.startswith("The cable to the cart was pulled")
     else:
         assert line == "The port took no bytes: check its cable, then connect again."
+
+
+@needs_browser
+@pytest.mark.parametrize("is_lost", [False, True], ids=["heard", "lost"])
+def test_home_is_asked_again_while_the_brake_acts(page: str, tmp_path: Path, is_lost: bool) -> None:
+    """The last host left a homed cart at speed. BUSY after a first HOME that was lost means the same."""
+    script = f"""
+    const send = SerialCart.prototype.send;
+    let left = {int(is_lost)};
+    SerialCart.prototype.send = function (name, ...values) {{
+      const isLost = name === "HOME" && left-- > 0;
+      WIRE.answerTimeout = isLost ? 0.1 : 200; // a repetition would pass another period
+      if (!isLost) return send.call(this, name, ...values);
+      this.sequence = (this.sequence + 1) & 0xff;
+      return this.sequence;
+    }};
+    SerialCart.prototype.consent = async function () {{
+      do this.asked = this.send("HELLO");
+      while ((await this.seen(true)).motor_applied !== -255);
+    }};
+    element("connect").click();
+    await until(() => real?.newest?.flags & WIRE.flags.HOMING || real?.driving || real?.done);
+    element("stop").click();
+    {ENDED}
+    """
+    with emulator() as host:
+        host.home()
+        host.ask(Start())
+        while host.ask(SetMotor(255))[-1].message.cart_counts < FAR_AND_FAST:
+            pass
+        with bridged(page, script, host, tmp_path) as bridge:
+            line, *_ = bridge.report()
+            assert line == "Stopped by hand."
+            check_stopped(bridge, host)
+    refused = [(refusal.type, refusal.reason) for refusal in read(bridge, Nack)]
+    assert set(refused) == {(Home.TYPE, Reason.BUSY)}
+    assert len(written(bridge, Home)) > len(refused)
 
 
 @needs_browser

@@ -261,8 +261,7 @@ class SerialCart {
         await this.event(end - performance.now());
         for (const { name: kind, message, states } of this.answers.splice(0)) {
           const { type, sequence, reason } = message, isOurs = NAMES[type] === name && asked.includes(sequence);
-          const heard = isOurs && reason === WIRE.busy && asked.length > 1; // the first time; its ACK was lost
-          if (kind === "NACK" && isOurs && !heard) throw new Error(this.refusal(message));
+          if (kind === "NACK" && isOurs) throw Object.assign(new Error(this.refusal(message)), { reason });
           if (isInfo ? kind === "INFO" && fits(message) : isOurs) return { ...message, states };
         }
       }
@@ -334,8 +333,7 @@ class SerialCart {
     if (fault) await this.ask("CLEAR_FAULT");
     this.line = "The cart homes: it moves by itself, usually for 15 to 40 s.";
     const before = this.newest;
-    await this.ask("HOME");
-    let state = await this.seen(true), renewed = before;
+    let state = await this.beginHoming(before), renewed = before;
     for (; state.flags & WIRE.flags.HOMING; state = await this.seen()) {
       if (seconds(before, state) > WIRE.homeTimeout) throw new Error("homing took too long: clear the track");
       if (between(renewed.time_us, state.time_us) < WIRE.lease) continue;
@@ -344,6 +342,23 @@ class SerialCart {
     }
     if (!(state.flags & WIRE.flags.HOMED)) throw new Error("homing ended, as the cart did not hear this page");
     this.trust(await this.ask("HELLO"));
+  }
+
+  /** Ask for HOME, again while the cart's brake acts. Return the first STATE since. */
+  async beginHoming(before) {
+    const { ARMED, HOMING } = WIRE.flags;
+    for (;;) {
+      try {
+        await this.ask("HOME");
+        return await this.seen(true);
+      } catch (error) {
+        if (error.reason !== WIRE.busy) throw error;
+        await this.ask("HELLO");
+        const state = await this.seen(true);
+        if (state.flags & HOMING) return state; // only the ACK was lost
+        if (state.flags & ARMED || seconds(before, state) > WIRE.homeTimeout) throw error;
+      }
+    }
   }
 
   /** Wait until the reader agrees that the cart moves. HELLO keeps an emulated cart without a clock going. */
