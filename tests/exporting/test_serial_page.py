@@ -310,6 +310,26 @@ def test_home_is_asked_again_while_the_brake_acts(page: str, tmp_path: Path, is_
 
 
 @needs_browser
+def test_a_cart_that_homes_although_its_acknowledgement_was_lost_is_not_refused(
+    page: str, tmp_path: Path
+) -> None:
+    script = f"""
+    const take = SerialCart.prototype.take;
+    let lost = 0;
+    SerialCart.prototype.take = function (frame) {{
+      if (frame?.name !== "ACK" || NAMES[frame.message.type] !== "HOME" || lost++) take.call(this, frame);
+    }};
+    {AGREED}
+    await until(() => real.soft || real.done);
+    element("stop").click();
+    {ENDED}
+    """
+    line, bridge = answer(page, script, tmp_path)
+    assert line == "Stopped by hand."
+    assert {(refusal.type, refusal.reason) for refusal in read(bridge, Nack)} == {(Home.TYPE, Reason.BUSY)}
+
+
+@needs_browser
 @pytest.mark.parametrize(
     ("event", "words"),
     [
