@@ -31,7 +31,8 @@ static int16_t rough_motor(double force)
         return 0;
     if (size > CART_GENTLE_FORCE)
         size = CART_GENTLE_FORCE;
-    return (int16_t)copysign(CART_MOTOR_OFFSET + CART_MOTOR_PER_NEWTON * size, force);
+    double motor = copysign(CART_MOTOR_OFFSET + CART_MOTOR_PER_NEWTON * size, force);
+    return (int16_t)cart_limit(motor, CART_LARGEST_MOTOR);
 }
 
 void cart_servo_reset(cart_servo *servo)

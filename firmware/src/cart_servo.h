@@ -11,7 +11,8 @@
 #include <stdint.h>
 
 /* The motor value of the largest force of these motions. */
-#define CART_FULL_PUSH ((int16_t)(CART_MOTOR_OFFSET + CART_MOTOR_PER_NEWTON * CART_GENTLE_FORCE))
+#define CART_GENTLE_MOTOR (CART_MOTOR_OFFSET + CART_MOTOR_PER_NEWTON * CART_GENTLE_FORCE)
+#define CART_FULL_PUSH ((int16_t)(CART_GENTLE_MOTOR < CART_LARGEST_MOTOR ? CART_GENTLE_MOTOR : CART_LARGEST_MOTOR))
 #define CART_METRES (CART_NANOMETRES / 1e9) /* per count */
 
 typedef struct {
