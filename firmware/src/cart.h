@@ -14,7 +14,7 @@
    bounded time; the longest, cart_tick while homing, passes a few times over CART_WINDOW_COUNTS counts.
 
    Units: us since boot, which never wrap (64 bits); raw counts, positive to the right, 0 where the cart stood
-   at boot, within 2^30; motor values -255 to 255, positive to the right. A `cart` needs about 2 kB. */
+   at boot, within 2^30; motor values -255 to 255, positive to the right. A `cart` needs about 1.2 kB. */
 #ifndef CART_H
 #define CART_H
 
