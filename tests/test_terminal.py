@@ -19,9 +19,9 @@ print("agreed" if confirm("the cart latched a fault: STALL") else "not agreed", 
 """
 
 
-def read_until(master: int, words: bytes, deadline: float = 60) -> bytes:
+def read_until(master: int, words: bytes) -> bytes:
     """Return the terminal output up to and including `words`."""
-    seen, end = b"", time.monotonic() + deadline
+    seen, end = b"", time.monotonic() + 60
     while words not in seen:
         assert time.monotonic() < end, seen
         seen += os.read(master, 1000)

@@ -7,10 +7,10 @@ from torch import Tensor, nn
 from cartpole_rl.agents.network import FrameReader, MirrorQNetwork, QNetwork
 
 
-def frame_reader(units: int = 16) -> FrameReader:
+def frame_reader() -> FrameReader:
     """Three frames of two numbers, and one number beside them."""
     torch.manual_seed(0)
-    return FrameReader(7, [[5, 6], [2, 4], [0, 1]], units)
+    return FrameReader(7, [[5, 6], [2, 4], [0, 1]], 16)
 
 
 def fitted(network: nn.Module, inputs: Tensor, expected: Tensor, updates: int) -> float:

@@ -199,7 +199,7 @@ def test_scores_are_kept_if_a_figure_cannot_be_written(trained: Path, tmp_path: 
     assert f"{score:.0f}" in done.out
 
 
-def test_the_next_command_identifies_the_pole_that_is_stated(tmp_path: Path) -> None:
+def test_the_next_command_identifies_the_pole_that_is_stated() -> None:
     """Whatever pole the agent knows: the pole's numbers set every force that is identified."""
     with EmulatedCart(EmulatorSettings()) as cart:
         on_cart = {"run": "pretrained/medium", "plant": "serial", "plant.port": cart.port}

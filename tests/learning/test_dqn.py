@@ -268,9 +268,9 @@ LIMIT = 20
 ONCE = {"carts": 64, "chunk": 3 * LIMIT, "transitions": 64 * 3 * LIMIT, "evaluations": 1, "n_step": 1}
 
 
-def greedy(training: Training, epsilon: float = 0.0) -> Training:
-    """Return a training that acts with `epsilon` from the start."""
-    settings = {"warmup_transitions": 0, "epsilon": (epsilon, epsilon)}
+def greedy(training: Training) -> Training:
+    """Return a training that takes no random action, from the start."""
+    settings = {"warmup_transitions": 0, "epsilon": (0.0, 0.0)}
     training.settings = training.settings.model_copy(update=settings)
     return training
 

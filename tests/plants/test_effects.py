@@ -7,7 +7,6 @@ import torch
 
 from cartpole_rl.choices import choice, conf_folder
 from cartpole_rl.physics.actuator import ACTUATORS
-from cartpole_rl.physics.friction import CART_FRICTIONS, POLE_FRICTIONS
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.effects import without_effect
@@ -19,12 +18,6 @@ from cartpole_rl.rig.hardware import nominal_encoders
 
 ACTIONS = sorted(path.stem for path in (conf_folder() / "actions").glob("*.yaml"))
 RANDOMIZATIONS = sorted(path.stem for path in (conf_folder() / "randomization").glob("*.yaml"))
-READ_BY = {  # where the default models do not
-    "cart_stiction_ratio": Models(CART_FRICTIONS.find("stribeck")),
-    "stribeck_velocity": Models(CART_FRICTIONS.find("stribeck")),
-    "pole_drag": Models(pole_friction=POLE_FRICTIONS.find("bearing")),
-    "pole_coulomb": Models(pole_friction=POLE_FRICTIONS.find("bearing")),
-}
 NARROW = {  # a per cent where nominal is not 0, and about as little where it is
     "backdrivability": (0.99, 1.0),
     "track_tilt": (0.0, 1e-4),

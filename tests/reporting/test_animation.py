@@ -43,9 +43,9 @@ def part(episode: Episode, start: int, steps: int, **other: object) -> Episode:
     return Episode(**{**values, "ended_by": episode.ended_by, **other})  # type: ignore[arg-type]
 
 
-def first(episode: Episode, title: str = "") -> Image.Image:
+def first(episode: Episode) -> Image.Image:
     """The first picture of an episode."""
-    return next(iter(frames(episode, POLE, TRACK, title)))
+    return next(iter(frames(episode, POLE, TRACK)))
 
 
 def test_ten_seconds_are_251_frames_of_real_time_and_a_rest(swing_up: Episode) -> None:

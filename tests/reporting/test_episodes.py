@@ -86,11 +86,11 @@ def test_the_page_of_an_episode_gets_its_pole_its_last_motor_value_and_no_number
     assert (shown["motor"][-1], shown["pole"]) == (swing_up.motor[-1], 0.4)
 
 
-def records(scores: list[float], transitions_apart: int = 100_000) -> list[dict]:
+def records(scores: list[float]) -> list[dict]:
     """Evaluations a second apart whose episodes lie 100 around the mean."""
     return [
         {
-            "transitions": (i + 1) * transitions_apart,
+            "transitions": (i + 1) * 100_000,
             "seconds": float(i + 1),
             "score": score,
             "score_min": score - 100,

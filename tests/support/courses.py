@@ -5,12 +5,12 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
 
-def course(env: EnvBase, steps: int, motors: int = 3) -> list[tuple[TensorDictBase, TensorDictBase]]:
+def course(env: EnvBase, steps: int) -> list[tuple[TensorDictBase, TensorDictBase]]:
     """Transitions and what follows them, after resets, under actions that are the same each time."""
     generator = torch.Generator().manual_seed(0)
     present, results = env.reset(), []
     for _ in range(steps):
-        present["action"] = torch.randint(motors, env.batch_size, generator=generator)
+        present["action"] = torch.randint(3, env.batch_size, generator=generator)
         transition, present = env.step_and_maybe_reset(present)
         results.append((transition.clone(recurse=False), present.clone(recurse=False)))  # the same tensors
     return results

@@ -35,17 +35,18 @@ STUDY: dict[str, Any] = {
         {"name": "heavy", "label": "heavy cart", "overrides": ["parameters={cart_mass:1.5}"]},
     ],
     "command": "evaluate",
+    "size": "quick",
     "sizes": {"quick": {"seeds": 3, "evaluation_overrides": ["episodes=2"]}},
 }
 PARAMETERS = {"little": {"cart_viscous": 0.2}, "much": {"cart_viscous": 3.0}}
 ONTO = {"nominal": {}, "heavy": {"cart_mass": 1.5}}
 
 
-def run_baseline(folder: Path, seed: int, parameters: dict[str, float], episodes: int = 2) -> None:
+def run_baseline(folder: Path, seed: int, parameters: dict[str, float]) -> None:
     """Evaluate energy and LQR for STEPS periods from poles near upright."""
     given = {
         "run": "lqr",
-        "episodes": episodes,
+        "episodes": 2,
         "seed": seed,
         "parameters": parameters,
         "task": "swingup",
@@ -58,7 +59,7 @@ def run_baseline(folder: Path, seed: int, parameters: dict[str, float], episodes
         evaluate(load_settings(EvaluateConfig, given), folder)
 
 
-def make_study(study: Path, size: str = "quick") -> None:
+def make_study(study: Path) -> None:
     """Make the folder of a study: its runs and its study.yaml."""
     first = study / "little/10/evaluations/nominal"
     run_baseline(first, 10, PARAMETERS["little"])
@@ -68,9 +69,7 @@ def make_study(study: Path, size: str = "quick") -> None:
                 place = study / arm / str(seed) / "evaluations" / name
                 if place != first:
                     copy_run(first, place, seed, {**parameters, **more}, 1 - 0.01 * (seed + 10 * number))
-    (study / "study.yaml").write_text(
-        yaml.safe_dump({**STUDY, "size": size, "sizes": {size: STUDY["sizes"]["quick"]}})
-    )
+    (study / "study.yaml").write_text(yaml.safe_dump(STUDY))
 
 
 def copy_run(run: Path, place: Path, seed: int, parameters: dict[str, float], factor: float) -> None:

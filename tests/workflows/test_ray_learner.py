@@ -224,8 +224,8 @@ class PipedLink(LearnerLink):
         self._read()
 
 
-def new_link(shown: list[str], kind: type[PipedLink] = PipedLink) -> PipedLink:
-    return kind(SETTINGS, Path(), lambda first: [], lambda: None, shown.append)
+def new_link(shown: list[str]) -> PipedLink:
+    return PipedLink(SETTINGS, Path(), lambda first: [], lambda: None, shown.append)
 
 
 @pytest.fixture

@@ -127,7 +127,7 @@ def test_a_board_that_homes_by_itself(tmp_path: Path) -> None:
 
 
 @pytest.mark.nightly
-def test_reversed_signs(tmp_path: Path) -> None:
+def test_reversed_signs() -> None:
     """The same motion, as seen from the other side."""
     with driven_board(cart_reversed=True, pole_reversed=True, full=-12.0) as plant:
         plant.reset_one()
