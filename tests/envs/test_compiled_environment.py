@@ -7,15 +7,11 @@ from typing import Any
 
 import pytest
 import torch
-from courses import course
+from courses import ANYWHERE, course
 
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.randomization.ranges import Range
-from cartpole_rl.tasks.settings import Start, StartSettings
 
-ANYWHERE = StartSettings(
-    angle=Start.ANY, position_spread=0.3, angle_spread=0, speed_spread=0.5, angular_speed_spread=1.0
-)
 RANGES = {"cart_mass": Range(relative=(-0.2, 0.2)), "angle_noise": Range(absolute=(1e-3, 1e-2))}
 
 pytestmark = pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler: install g++")

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch
+from courses import ANYWHERE
 from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs.utils import check_env_specs
@@ -19,13 +20,9 @@ from cartpole_rl.plants.serial.plant import emulated_plant
 from cartpole_rl.randomization.ranges import Range
 from cartpole_rl.tasks.features import MOTOR_SCALE, Measured, ObservationKind, observe
 from cartpole_rl.tasks.rewards import Reward
-from cartpole_rl.tasks.settings import Start, StartSettings
 
 Simulated = Callable[..., CartPoleEnv]
 MOTORS = (-250, -100, 0, 100, 250)
-ANYWHERE = StartSettings(
-    angle=Start.ANY, position_spread=0.2, angle_spread=0, speed_spread=0.2, angular_speed_spread=1.0
-)
 
 
 def actions(count: int, carts: int) -> Tensor:

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 import torch
-from courses import course
+from courses import ANYWHERE, course
 from tensordict import TensorDictBase
 from torchrl.envs import TransformedEnv
 
@@ -14,12 +14,8 @@ from cartpole_rl.envs.hardware import HardwareTransform
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.randomization.ranges import Range
-from cartpole_rl.tasks.settings import Start, StartSettings
 
 CARTS, LIMIT = 32, 60
-ANYWHERE = StartSettings(
-    angle=Start.ANY, position_spread=0.2, angle_spread=0, speed_spread=0.5, angular_speed_spread=1.0
-)
 RANGES = {
     "cart_mass": Range(relative=(-0.2, 0.2)),
     "latency": Range(absolute=(0.0, 0.03)),

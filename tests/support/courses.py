@@ -1,8 +1,14 @@
-"""Courses of many simulated carts under random actions."""
+"""Courses of many simulated carts under random actions, and starts that are spread widely."""
 
 import torch
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
+
+from cartpole_rl.tasks.settings import Start, StartSettings
+
+ANYWHERE = StartSettings(
+    angle=Start.ANY, position_spread=0.3, angle_spread=0, speed_spread=0.5, angular_speed_spread=1.0
+)
 
 
 def course(env: EnvBase, steps: int) -> list[tuple[TensorDictBase, TensorDictBase]]:
