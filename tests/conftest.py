@@ -29,7 +29,7 @@ import files_read_once  # noqa: F401
 import pytest
 import torch
 import yaml
-from command_line import no_pictures
+from command_line import no_pictures, same_handlers
 from filelock import FileLock
 from hypothesis import HealthCheck, settings
 
@@ -146,6 +146,12 @@ def all_carts() -> Iterator[None]:
 @pytest.fixture
 def without_pictures() -> Iterator[None]:
     with no_pictures():
+        yield
+
+
+@pytest.fixture
+def same_signals() -> Iterator[None]:
+    with same_handlers():
         yield
 
 

@@ -24,13 +24,7 @@ from cartpole_rl.exits import Terminated
 from cartpole_rl.signals import UNWINDING, RaiseOnce, ending_signals
 from cartpole_rl.workflows.find_port import FindPortConfig
 
-
-@pytest.fixture(autouse=True)
-def handlers() -> object:
-    before = {number: signal.getsignal(number) for number in HANDLED}
-    yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
+pytestmark = pytest.mark.usefixtures("same_signals")
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129)])

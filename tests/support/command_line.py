@@ -60,7 +60,7 @@ DISTILLATION = tuple(
     f"distillation.{name}={value}"
     for name, value in {"carts": 8, "rounds": 2, "periods": 5, "updates": 3, "batch_size": 16}.items()
 )
-HANDLED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # by a command; a test restores its own
+HANDLED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # by a command
 ONCE = "learning.evaluations=1"  # most of a tiny training's time goes into pictures of its evaluations
 
 
@@ -85,9 +85,9 @@ def in_process(
 ) -> Outcome:
     """`cartpole-<command> words...` in `folder`, or with a `function` in place of its own and its checks."""
     GlobalHydra.instance().clear()
-    handlers = {number: signal.getsignal(number) for number in HANDLED}
     out, err, code = io.StringIO(), io.StringIO(), 0
     with (
+        same_handlers(),
         patch.object(sys, "argv", [f"cartpole-{command}", *words]),
         contextlib.chdir(folder),
         contextlib.redirect_stdout(out),
@@ -100,10 +100,18 @@ def in_process(
             run_command(command, verb)
         except SystemExit as exit_:
             code = int(exit_.code or 0)
-        finally:
-            for number, handler in handlers.items():
-                signal.signal(number, handler)
     return Outcome(code, out.getvalue(), err.getvalue())
+
+
+@contextlib.contextmanager
+def same_handlers() -> Iterator[None]:
+    """Give the signals that a command handles their handlers back."""
+    handlers = {number: signal.getsignal(number) for number in HANDLED}
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
 
 
 @contextlib.contextmanager

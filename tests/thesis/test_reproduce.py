@@ -18,7 +18,7 @@ import psutil
 import pytest
 import reproduce as script
 import yaml
-from command_line import HANDLED, TINY, Outcome, outcome
+from command_line import TINY, Outcome, outcome, same_handlers
 from plan import Task, plan
 from reproduce import Schedule, reproduce
 from study import Study
@@ -120,10 +120,8 @@ def called(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], 
     def call(*words: object) -> Outcome:
         monkeypatch.chdir(Path.cwd())  # the script changes it
         monkeypatch.setattr(sys, "argv", ["", "--studies", str(source), *map(str, words)])
-        handlers = {number: signal.getsignal(number) for number in HANDLED}
-        code = script.main()
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
+        with same_handlers():
+            code = script.main()
         return Outcome(code, *capsys.readouterr())
 
     return call

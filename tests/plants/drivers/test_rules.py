@@ -5,7 +5,7 @@ import re
 import signal
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from threading import Event
 from typing import Any
 
@@ -24,6 +24,7 @@ from cartpole_rl.signals import RaiseOnce, until_stopped
 from cartpole_rl.wire.frames import encode_frame
 from cartpole_rl.wire.messages import Fault, Flags, Home, Message, Stop
 
+pytestmark = pytest.mark.usefixtures("same_signals")  # the end of a bridge replaces handlers
 RIG = hardware_of(choice("cart/stepper"))  # 25 um, 4096 counts a turn
 PERIOD_US = 10_000
 
@@ -424,16 +425,6 @@ def test_no_command_is_infinite() -> None:
     bridge = Playing()
     with pytest.raises(LinkError, match="the command nan is not finite"):
         bridge._send_value(math.nan)
-
-
-@pytest.fixture(autouse=True)
-def _same_signals() -> Iterator[None]:
-    """Give signals their handlers back, which the end of a bridge replaces."""
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    before = [signal.getsignal(number) for number in numbers]
-    yield
-    for number, handler in zip(numbers, before, strict=True):
-        signal.signal(number, handler)
 
 
 def test_a_driver_that_raises_anything_leaves_a_stopped_board() -> None:
