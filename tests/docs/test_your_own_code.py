@@ -1,19 +1,14 @@
 """Every recipe of docs/your-own-code.md runs, in the order of the page, in at most 30 lines."""
 
-import contextlib
-import io
 import re
 import sys
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
 from torchrl.objectives import DQNLoss
-from toy_settings import TOY
+from toy_settings import run_block, work_in
 
-from cartpole_rl.settings import Settings
-from cartpole_rl.workflows import config as configs
 from cartpole_rl.workflows.build import network_of, new_agent, trained_agent
 
 PAGE = Path(__file__).parents[2] / "docs/your-own-code.md"
@@ -24,13 +19,7 @@ PRINTED = re.compile(r"^ *print\(.*\)  # (.*)$", re.M)
 @pytest.mark.nightly  # test_commands.py reads the blocks in every run
 @pytest.mark.usefixtures("without_pictures", "own_extensions")
 def test_every_recipe_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    load = configs.load_settings
-
-    def load_toy(schema: type[Settings], overrides: Mapping[str, Any]) -> Settings:
-        return load(schema, {**overrides, **TOY.get(schema, {})})
-
-    monkeypatch.setattr(configs, "load_settings", load_toy)
-    monkeypatch.chdir(tmp_path)
+    work_in(tmp_path, monkeypatch)
     monkeypatch.setattr(sys, "path", [*sys.path])
     names: dict[str, Any] = {"__name__": "notebook"}
     for block in BLOCKS:
@@ -39,11 +28,10 @@ def test_every_recipe_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
             monkeypatch.delitem(sys.modules, Path(file[1]).stem, raising=False)
             Path(file[1]).write_text(block, encoding="utf-8")
             continue
-        with contextlib.redirect_stdout(io.StringIO()) as output:
-            exec(compile(block, PAGE.name, "exec"), names)
+        output = run_block(block, PAGE, names)
         for expected in PRINTED.findall(block):
-            assert expected in output.getvalue().splitlines()
-    assert "['against', 'network', 'stock'] 6 episodes failed" in output.getvalue()
+            assert expected in output.splitlines()
+    assert "['against', 'network', 'stock'] 6 episodes failed" in output
     agent = trained_agent(Path("runs/train/stock"))
     assert network_of(agent).plain_layers()  # it can be exported
     assert type(new_agent(agent.training).loss) is DQNLoss

@@ -1,8 +1,15 @@
-"""Settings with which each command of a page takes seconds."""
+"""Settings with which each command of a page takes seconds, and how to run its Python blocks with them."""
 
+import contextlib
+import io
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
+import pytest
+
 from cartpole_rl.settings import Settings
+from cartpole_rl.workflows import config as configs
 from cartpole_rl.workflows.config import (
     EvaluateConfig,
     FinetuneConfig,
@@ -44,3 +51,21 @@ TOY: dict[type[Settings], dict[str, Any]] = {
         "compile": False,
     },
 }
+
+
+def work_in(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make `folder` the working directory, in which settings are of toy size."""
+    load = configs.load_settings
+
+    def load_toy(schema: type[Settings], overrides: Mapping[str, Any]) -> Settings:
+        return load(schema, {**overrides, **TOY.get(schema, {})})
+
+    monkeypatch.setattr(configs, "load_settings", load_toy)
+    monkeypatch.chdir(folder)
+
+
+def run_block(block: str, page: Path, names: dict[str, Any]) -> str:
+    """Run a Python block of a page, which reads and changes `names`; return what it printed."""
+    with contextlib.redirect_stdout(io.StringIO()) as output:
+        exec(compile(block, page.name, "exec"), names)
+    return output.getvalue()
