@@ -29,7 +29,8 @@ import files_read_once  # noqa: F401
 import pytest
 import torch
 import yaml
-from command_line import no_pictures, same_handlers
+from command_line import Once, no_pictures, same_handlers
+from courses import scattered
 from filelock import FileLock
 from hypothesis import HealthCheck, settings
 
@@ -48,7 +49,7 @@ from cartpole_rl.registry import Registry
 from cartpole_rl.reporting import style
 from cartpole_rl.rig.hardware import parameters_of
 from cartpole_rl.rig.parameters import PARAMETERS, completed
-from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, Start, StartSettings, TaskSettings
+from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, StartSettings, TaskSettings
 
 CONF = Path(__file__).parents[1] / "conf"
 
@@ -114,7 +115,7 @@ def make_cart(ip02: dict[str, float], medium: PoleSettings) -> Callable[..., Car
 
 
 @pytest.fixture(scope="session")
-def once(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., tuple[Path, Any]]:
+def once(tmp_path_factory: pytest.TempPathFactory) -> Once:
     """Let one worker fill a folder; every worker gets a copy of its own, and what `make` returned."""
     own = tmp_path_factory.getbasetemp()
     shared = (own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / "shared"
@@ -167,9 +168,7 @@ def own_extensions() -> Iterator[None]:
         del PARAMETERS[name]
 
 
-STILL = StartSettings(
-    angle=Start.HANGING, position_spread=0, angle_spread=0, speed_spread=0, angular_speed_spread=0
-)
+STILL = scattered()
 
 
 @pytest.fixture(scope="session")

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from courses import scattered
 from tensordict import TensorDict
 
 from cartpole_rl.agents.baseline import EnergyAndRegulator, decode, linearized, regulator
@@ -23,13 +24,9 @@ from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.tasks.episode import is_upright
 from cartpole_rl.tasks.features import Measured, ObservationKind, observe
-from cartpole_rl.tasks.settings import Start, StartSettings
 
 PERIOD = 0.02
 MOTORS = tuple(choice("actions/nine_levels")["motors"])
-HANGING = StartSettings(
-    angle=Start.HANGING, position_spread=0.1, angle_spread=0, speed_spread=0, angular_speed_spread=0
-)
 
 
 def poles(name: str) -> PoleSettings:
@@ -99,7 +96,7 @@ def test_it_brakes_before_the_end_of_the_track(ip02: dict[str, float]) -> None:
 def test_it_swings_up_and_balances_the_simulated_cart(
     pole: str, score: float, ip02: dict[str, float], simulated: Callable[..., CartPoleEnv]
 ) -> None:
-    env = simulated(20, {"poles": poles(pole), "start": HANGING}, motors=MOTORS)
+    env = simulated(20, {"poles": poles(pole), "start": scattered(position_spread=0.1)}, motors=MOTORS)
     episodes = run_batch(env, baseline(ip02, pole))
     assert {episode.ended_by for episode in episodes} == {"time"}
     assert all(is_upright(episode.theta[-100:]).all() for episode in episodes)

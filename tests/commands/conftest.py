@@ -1,8 +1,6 @@
 """Runs that several test files share; two are trainings, of which one was interrupted."""
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 from command_line import (
@@ -10,14 +8,13 @@ from command_line import (
     FINETUNING,
     IDENTIFICATION,
     TINY,
+    Once,
     Outcome,
     in_process,
     interrupt_after,
     no_pictures,
     prints_only_progress,
 )
-
-Once = Callable[..., tuple[Path, Any]]
 
 
 @pytest.fixture(scope="session")

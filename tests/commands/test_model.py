@@ -178,12 +178,3 @@ def test_a_missing_or_damaged_model_is_one_line(tmp_path: Path) -> None:
         done = in_process("train", "plant=learned", given, *TINY, folder=tmp_path)
         assert done.complaint.startswith(f"cartpole-train: {complaint}")
         assert done.code == code
-
-
-def test_too_short_a_recording_says_so(recorded: Path, tmp_path: Path) -> None:
-    lines = (recorded / "recordings/episode_000.csv").read_text().splitlines()
-    heading = sum(line.startswith("#") for line in lines)
-    (tmp_path / "short.csv").write_text("\n".join([*lines[: heading + 80], lines[-1]]) + "\n")
-    done = in_process("model", "from=short.csv", *ENSEMBLE, folder=tmp_path)
-    assert "the held-out recordings have no 1.44 s without a lost frame: record longer" in done.err
-    assert done.code == 2

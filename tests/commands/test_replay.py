@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import yaml
-from command_line import Outcome, in_process
+from command_line import ENSEMBLE, Outcome, in_process
 
 from cartpole_rl.choices import choice
 
@@ -126,14 +126,18 @@ def test_the_recorded_poles_are_one_that_is_known(
     assert done.code in (1, 2)
 
 
-def test_a_recording_too_short_for_any_error_says_so(recorded: Path, tmp_path: Path) -> None:
+def test_too_short_a_recording_says_so(recorded: Path, tmp_path: Path) -> None:
     lines = (recorded / "recordings/episode_000.csv").read_text().splitlines()
     heading = sum(line.startswith("#") for line in lines)
-    (tmp_path / "short.csv").write_text("\n".join([*lines[: heading + 9], lines[-1]]) + "\n")
-    done = in_process("replay", "from=short.csv", "hydra.run.dir=run", folder=tmp_path)
-    assert "from=short.csv: no recording lasts 0.2 s without a lost frame: record longer" in done.complaint
-    assert done.code == 2
-    assert not (tmp_path / "run").exists()
+    for words, rows, complaint in (
+        (["replay"], 9, "from=short.csv: no recording lasts 0.2 s"),
+        (["model", *ENSEMBLE], 80, "the held-out recordings have no 1.44 s"),
+    ):
+        (tmp_path / "short.csv").write_text("\n".join([*lines[: heading + rows], lines[-1]]) + "\n")
+        done = in_process(*words, "from=short.csv", "hydra.run.dir=run", folder=tmp_path)
+        assert f"{complaint} without a lost frame: record longer" in done.complaint
+        assert done.code == 2
+        assert not (tmp_path / "run").exists()
 
 
 def test_wrong_parameters_and_poles_are_named(recorded: Path, tmp_path: Path) -> None:

@@ -3,12 +3,11 @@
 import json
 import math
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import pytest
-from command_line import Outcome, in_process, no_pictures
+from command_line import Once, Outcome, in_process, no_pictures
 
 from cartpole_rl.run_folder import USES, program_of, use_of, write_config
 
@@ -62,7 +61,7 @@ def runs(
     tuned: tuple[Path, Outcome],
     recorded: Path,
     learned: tuple[Path, Outcome],
-    once: Callable[..., tuple[Path, Any]],
+    once: Once,
 ) -> Path:
     """A folder with a toy run of each command, named after it, and an interrupted training."""
     made = {

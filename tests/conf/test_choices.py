@@ -1,12 +1,12 @@
 """Every choice of every group composes, is read to the last key, and describes a cart that can be made."""
 
-from collections.abc import Iterator
 from functools import cache
 from itertools import chain, zip_longest
 from typing import Any
 
 import pytest
 import yaml
+from every_command import leaves
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from cartpole_rl.checking import validated
@@ -80,15 +80,6 @@ def test_an_evaluation_can_replace_the_agents_choice(chosen: list[str], trained:
 def test_fine_tuning_takes_it(chosen: str) -> None:
     words = ("run=somewhere", f"finetuning={chosen}")
     assert validated(FinetuneConfig, composed("finetune", *words)).finetuning.iterations > 0
-
-
-def leaves(tree: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Each number, text or list in nested mappings by its dotted name."""
-    if not isinstance(tree, dict):
-        yield prefix.removesuffix("."), tree
-        return
-    for key, value in tree.items():
-        yield from leaves(value, f"{prefix}{key}.")
 
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)

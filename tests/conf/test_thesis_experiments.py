@@ -4,10 +4,10 @@ If the thesis gives no value, ours is listed as "silent", so that no setting is 
 """
 
 import math
-from collections.abc import Iterator, Mapping
 from typing import Any
 
 import pytest
+from every_command import leaves
 
 from cartpole_rl.choices import conf_folder
 from cartpole_rl.rig.hardware import HARDWARE
@@ -177,14 +177,6 @@ def settings(experiment: str) -> dict[str, Any]:
     of_the_rig = {f"cart.{name}" for name in HARDWARE}  # no agent reads it
     found = leaves(config.model_dump(mode="json", exclude=OF_THE_RUN))
     return {name: value for name, value in found if name not in of_the_rig}
-
-
-def leaves(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in config.items():
-        if isinstance(value, dict) and value:
-            yield from leaves(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
 
 
 @pytest.mark.parametrize("experiment", EXPECTED)

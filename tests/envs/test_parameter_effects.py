@@ -9,18 +9,17 @@ from collections.abc import Callable
 
 import pytest
 import torch
+from courses import scattered
 from torch import Tensor
 
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.randomization.ranges import Range
-from cartpole_rl.tasks.settings import Start, StartSettings
+from cartpole_rl.tasks.settings import Start
 
 CARTS, STEPS = 32, 20
-UPRIGHT = StartSettings(
-    angle=Start.UPRIGHT, position_spread=0, angle_spread=0, speed_spread=0, angular_speed_spread=0
-)
+UPRIGHT = scattered(Start.UPRIGHT)
 # the bounds of a parameter
 CASES: dict[str, tuple[float, float]] = {
     "cart_mass": (0.5, 0.9),

@@ -6,12 +6,13 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
+from courses import scattered
 from tensordict import TensorDict, TensorDictBase
 
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.evaluation.episodes import Knocks, run_episodes
 from cartpole_rl.plants.simulated import SimulatedPlant
-from cartpole_rl.tasks.settings import Start, StartSettings
+from cartpole_rl.tasks.settings import Start
 
 RIGHT, NONE = 2, 1  # of the motor values -200, 0, 200
 CONSTANT = {"kind": "constant", "scale": 1.0, "track_penalty": 7.0}
@@ -19,11 +20,6 @@ CONSTANT = {"kind": "constant", "scale": 1.0, "track_penalty": 7.0}
 
 def always(action: int) -> Callable[[TensorDictBase], TensorDictBase]:
     return lambda seen: seen.set("action", torch.full(seen.batch_size, action))
-
-
-def scattered(angle: Start = Start.HANGING, **spreads: float) -> StartSettings:
-    none = dict.fromkeys(("position_spread", "angle_spread", "speed_spread", "angular_speed_spread"), 0.0)
-    return StartSettings(angle=angle, **{**none, **spreads})
 
 
 def test_the_batch_does_not_change_the_count(simulated: Callable) -> None:

@@ -6,6 +6,7 @@ from functools import cache, partial
 import numpy as np
 import pytest
 import torch
+from courses import scattered
 from shaken import MOTORS, shaken
 
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
@@ -22,13 +23,10 @@ from cartpole_rl.plants.learned import LearnedModel, LearnedPlant
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.randomization.randomizer import Randomizer
-from cartpole_rl.tasks.settings import Start, StartSettings
 
 PERIOD, SUBSTEPS = 0.02, 1
 STEP = Models.of(cart_friction="step")
-START = StartSettings(
-    angle=Start.HANGING, position_spread=0.2, angle_spread=0.5, speed_spread=0, angular_speed_spread=0
-)
+START = scattered(position_spread=0.2, angle_spread=0.5)
 TRACK = {"track_half_length": 2.0}
 RIPPLE = 0.6  # N
 PITCH = 0.08  # m

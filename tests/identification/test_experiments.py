@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from command_line import Once
 from tensordict import TensorDict
 
 from cartpole_rl.emulator.settings import EmulatorSettings
@@ -43,9 +44,7 @@ from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.plants.specs import Numbers, OneCartPlant, PlantOutput
 from cartpole_rl.rig.hardware import Hardware, hardware_of, nominal_encoders, nominal_hardware
 from cartpole_rl.tasks.episode import Episode
-from cartpole_rl.tasks.settings import Start, StartSettings
 
-Once = Callable[..., tuple[Path, Any]]
 PERIOD = 0.02
 MODELS = Models.of(cart_friction="step", pole_friction="bearing")
 TRUTH = {
@@ -67,9 +66,6 @@ SHORTER = {
     "excite": partial(excite, seconds=20.0),
     "held_out": partial(excite, seconds=12.0),
 }
-HANGING = StartSettings(
-    angle=Start.HANGING, position_spread=0, angle_spread=0, speed_spread=0, angular_speed_spread=0
-)
 
 
 class SimulatedCart(OneCartPlant):
@@ -85,7 +81,7 @@ class SimulatedCart(OneCartPlant):
 @pytest.fixture(scope="module")
 def recordings(make_plant: Callable[..., SimulatedPlant], once: Once) -> dict[str, Episode]:
     def make(_: Path) -> dict[str, Episode]:
-        plant = make_plant(1, cart=TRUTH, models=MODELS, start=HANGING)
+        plant = make_plant(1, cart=TRUTH, models=MODELS)
         shorter = tuple(each._replace(moves=SHORTER.get(each.name, each.moves)) for each in EXPERIMENTS)
         return {each.name: episode for each, episode in conduct(plant, PERIOD, experiments=shorter)}
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from courses import scattered
 from small_files import files_of_at_most
 
 from cartpole_rl.errors import CheckpointError
@@ -17,12 +18,9 @@ from cartpole_rl.plants.learned import FORMAT, LearnedModel, LearnedPlant, load_
 from cartpole_rl.plants.simulated import SimulatedPlant
 from cartpole_rl.randomization.poles import PoleSettings
 from cartpole_rl.randomization.randomizer import Randomizer
-from cartpole_rl.tasks.settings import Start, StartSettings
 
 STEP = Models(cart_friction=CART_FRICTIONS.find("step"))
-START = StartSettings(
-    angle=Start.HANGING, position_spread=0.1, angle_spread=0.1, speed_spread=0, angular_speed_spread=0
-)
+START = scattered(position_spread=0.1, angle_spread=0.1)
 CARTS = 6
 
 MakeLearned = Callable[..., LearnedPlant]

@@ -63,6 +63,8 @@ DISTILLATION = tuple(
 HANDLED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # by a command
 ONCE = "learning.evaluations=1"  # most of a tiny training's time goes into pictures of its evaluations
 
+Once = Callable[..., tuple[Path, Any]]  # the fixture: one worker fills a folder, and what it returned
+
 
 @dataclass(frozen=True)
 class Outcome:

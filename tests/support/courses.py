@@ -1,4 +1,4 @@
-"""Courses of many simulated carts under random actions, and starts that are spread widely."""
+"""Courses of many simulated carts under random actions, and where they start."""
 
 import torch
 from tensordict import TensorDictBase
@@ -6,9 +6,14 @@ from torchrl.envs import EnvBase
 
 from cartpole_rl.tasks.settings import Start, StartSettings
 
-ANYWHERE = StartSettings(
-    angle=Start.ANY, position_spread=0.3, angle_spread=0, speed_spread=0.5, angular_speed_spread=1.0
-)
+
+def scattered(angle: Start = Start.HANGING, **spreads: float) -> StartSettings:
+    """Starts at exactly `angle`, at rest, in the middle, but for `spreads`."""
+    none = dict.fromkeys(("position_spread", "angle_spread", "speed_spread", "angular_speed_spread"), 0.0)
+    return StartSettings(angle=angle, **{**none, **spreads})
+
+
+ANYWHERE = scattered(Start.ANY, position_spread=0.3, speed_spread=0.5, angular_speed_spread=1.0)
 
 
 def course(env: EnvBase, steps: int) -> list[tuple[TensorDictBase, TensorDictBase]]:

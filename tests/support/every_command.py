@@ -1,7 +1,8 @@
-"""Every command with its groups, and what it needs to start."""
+"""Every command with its groups, and what it needs to start; settings by dotted name."""
 
 import os
 import warnings
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,15 @@ GROUPS = [
     (command, group) for command in SCHEMAS for group in default_choices(command) if group not in NOT_ALONE
 ]
 COMMANDS = sorted({command for command, _ in GROUPS})
+
+
+def leaves(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield each number, text, list or empty mapping in nested mappings by its dotted name."""
+    for key, value in config.items():
+        if isinstance(value, dict) and value:
+            yield from leaves(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
 
 
 def run(command: str, *words: str, folder: Path) -> tuple[Outcome, Settings | None]:
