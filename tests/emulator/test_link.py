@@ -1,49 +1,46 @@
 """The emulator's end of the cable: whole frames or none, and how a bad cable disturbs them."""
 
-import os
-import tty
-
 import pytest
-import serial
+from serial_peer import wait_for
 
-from cartpole_rl.emulator.link import Disturbance, PtyLink
+from cartpole_rl.emulator.link import Disturbance, Link, PtyLink, TcpLink
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.errors import FrameError
-from cartpole_rl.wire.frames import FrameSplitter, decode_frame, encode_frame
+from cartpole_rl.plants.serial.port import open_port
+from cartpole_rl.wire.frames import decode_frame, encode_frame
 from cartpole_rl.wire.messages import SetMotor
 
-
-def test_a_host_that_does_not_read_loses_whole_frames_and_never_half_of_one():
-    with PtyLink() as link:
-        host = os.open(link.port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
-        tty.setraw(host)
-        for number in range(5000):
-            link.offer(encode_frame(SetMotor(number), number))
-        came = []
-        splitter = FrameSplitter()
-        for number in range(5000, 5100):  # the line drains, and what is new gets through again
-            while True:
-                try:
-                    came += [decode_frame(stuffed) for stuffed in splitter.feed(os.read(host, 4096))]
-                except BlockingIOError:
-                    break
-            link.offer(encode_frame(SetMotor(number), number))
-        os.close(host)
-    motors = [frame.message.motor for frame in came]
-    assert motors == sorted(set(motors))
-    assert motors[0] == 0
-    assert 100 < len(motors) < 5000
-    assert motors[-1] > 5000
+EACH_LINK = pytest.mark.parametrize("kind", [PtyLink, TcpLink])
 
 
-def test_a_host_that_opens_the_port_is_noticed():
-    with PtyLink() as link:
+@EACH_LINK
+def test_a_host_that_does_not_read_loses_whole_frames_and_never_half_of_one(kind: type[Link]) -> None:
+    first, *lost, last = (encode_frame(SetMotor(number), number) for number in range(1000))
+    with kind() as link, open_port(link.port, 921600, 1.0) as host:
+        link.read(5)
+        long, seen = bytes([1]) * 10_000_000, bytearray()  # the buffers take less
+        for frame in (first, long, *lost):
+            link.offer(frame)
+        while last not in seen[len(long) :]:  # the line drains, and what is new gets through again
+            seen += host.read(host.in_waiting or 1)
+            link.offer(last)
+    assert seen.startswith(first + long + last)
+
+
+@EACH_LINK
+def test_a_host_that_opens_the_port_is_noticed_and_bytes_arrive(kind: type[Link]) -> None:
+    with kind() as link:
         assert link.read(0) == b""
         assert not link.opened
-        with serial.Serial(link.port) as host:
-            host.write(b"hello")
-            assert link.read(5) == b"hello"
+        with open_port(link.port, 921600, 1.0) as host:
+            assert link.read(5) == b""
             assert link.opened
+            host.write(bytes(range(256)))
+            assert link.read(5) == bytes(range(256))
+            link.write(bytes(1000))
+            wait_for(lambda: host.in_waiting == 1000, 20)
+            assert host.read(1000) == bytes(1000)
+            assert host.in_waiting == 0
 
 
 FRAME = encode_frame(SetMotor(-200), 4)[:-1]
