@@ -207,6 +207,8 @@ class _OwnChoices:
         if match is None or not (conf_folder() / match[1]).is_dir() or match[1] == "hydra":
             return word
         group, text = match[1], match[2]
+        if group not in self.groups:
+            return word  # Hydra refuses it
         if text == "null":
             raise ConfigError(NO_CHOICE.format(group))
         elements = _elements(word, text)

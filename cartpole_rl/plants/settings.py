@@ -202,7 +202,7 @@ class RealCartSettings(PlantSettings):
     place = "cartpole_rl.plants.serial.plant:cart_on_port"
     is_on_port = True
     can_be_damaged: ClassVar = True
-    ignored = OF_SIMULATION
+    ignored: ClassVar[tuple[str, ...]] = OF_SIMULATION
     port: Annotated[str, Field(min_length=1)]  # /dev/ttyUSB0, COM3, a URL of pyserial, or auto: the only cart
     baud: Annotated[int, Field(ge=1, le=12_000_000)] = 921600  # 115200 is allowed too
     pole_length: Annotated[float, Field(gt=0, le=3)] | None = None  # m, twice pivot to centre of mass
@@ -274,6 +274,7 @@ class SerialSettings(RealCartSettings):
 class BoardSettings(RealCartSettings):
     """A cart with firmware of its own, for which this computer stands in for ours (docs/my-cart.md)."""
 
+    ignored = tuple(name for name in OF_SIMULATION if name != "cart")  # a board does not tell its rig
     driver: Annotated[Extension, DRIVERS]
     # hand: a person puts the cart in the middle; board: its own homing; stops: this computer finds the stops.
     homing: Literal["hand", "board", "stops"] = "hand"

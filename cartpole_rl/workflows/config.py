@@ -146,7 +146,8 @@ class TrainConfig(RunSettings, CartPoleSettings):
         if learning.iterations < learning.evaluations:
             raise ValueError(
                 f"learning.transitions={learning.transitions} is too few; give at least "
-                f"{learning.carts * learning.chunk * learning.evaluations}, or fewer evaluations"
+                f"{learning.carts * learning.chunk * learning.evaluations}, or "
+                f"learning.evaluations={max(1, learning.iterations)}"
             )
         if self.buffer.size < learning.batch_size:
             raise ValueError(

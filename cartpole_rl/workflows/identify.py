@@ -50,11 +50,13 @@ from cartpole_rl.rig.hardware import Hardware
 from cartpole_rl.rig.parameters import PARAMETERS
 from cartpole_rl.run_folder import (
     CART,
+    CONFIG,
     FIGURES,
     IDENTIFIED,
     PAGE,
     POLE,
     POSTERIOR,
+    PROVENANCE,
     RANDOMIZATION,
     RECORDINGS,
     experiments,
@@ -127,6 +129,9 @@ def identify_cart(config: IdentifyConfig, folder: Path, words: Sequence[str] | N
                 print(f"{shown(folder)}/{RECORDINGS}/ holds {kept} of {len(EXPERIMENTS)} experiments; next:")
                 words = as_word("from", shown(folder)), *words_given("cart", "pole", "control_period")
                 print("cartpole-identify", *words)
+            else:  # the folder stays free for the next attempt
+                for name in (CONFIG, PROVENANCE):
+                    (folder / name).unlink()
             raise
     files = experiments(source)
     loaded = {name: read_recording(path) for name, path in files.items()}

@@ -415,6 +415,8 @@ def print_summary(
         print("the recordings are too short, or show too little motion, to question their sensors")
     for doubt in found:
         print(f"doubt: {doubt}")
+    if found:
+        print("mend the layout where a doubt is right, and import again")
     unknown = [] if config.hardware == nominal_hardware() else ["cart=<yours>.yaml"]
     words = [as_word("from", shown(folder)), *(words_given("cart") or unknown), "pole=<yours>.yaml"]
     if not math.isclose(period, choice("identify")["control_period"]):

@@ -22,7 +22,7 @@ def check_cart(config: PreflightConfig) -> None:
     """
     plant, hardware = config.plant, config.hardware
     faults = FaultClearing(plant.clear_faults, confirm if plant.can_be_damaged else always)
-    asked = asking(plant, confirm) if isinstance(plant, BoardSettings) else lambda: None
+    asked = asking(plant, hardware, confirm) if isinstance(plant, BoardSettings) else lambda: None
     finding: Finding | None = None
     with (
         plant.reachable(config.emulator.of_cart(config.cart), hardware) as settings,

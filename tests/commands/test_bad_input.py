@@ -44,7 +44,7 @@ WRONG_TRAINING = [
         "give at least 24576, or a shorter warm-up",
     ),
     ("learning.return_time=1", "learning.return_time=1 s is 50 control periods", "give at most 0.4"),
-    ("learning.transitions=100", "learning.transitions=100 is too few", "or fewer evaluations"),
+    ("learning.transitions=100", "learning.transitions=100 is too few", "or learning.evaluations=1"),
     (
         "resume=a learning.transitions=100",
         "resume uses that run's own config",

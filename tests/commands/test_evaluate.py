@@ -187,6 +187,15 @@ def test_bad_input_is_told_in_a_line(
     assert not list(evaluated.glob("runs/evaluate/*"))
 
 
+def test_the_cart_of_a_board_that_tells_nothing_is_compared(trained: Path, tmp_path: Path) -> None:
+    board = ("plant=text", f"plant.port={tmp_path}/none", "plant.full=255")
+    done = in_process("evaluate", f"run={trained}", *board, "cart=stepper", folder=tmp_path)
+    assert done.complaint == (
+        "cartpole-evaluate: cart: it has 25000 nm and 1/4096 turn a count, 0.6 m of track, but the agent was "
+        "trained for 22749 nm and 1/4096 turn a count, 0.814 m of track; train one for this cart"
+    )
+
+
 def test_scores_are_kept_if_a_figure_cannot_be_written(trained: Path, tmp_path: Path) -> None:
     """As on a full disk."""
     (tmp_path / "full").mkdir()

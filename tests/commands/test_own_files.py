@@ -234,6 +234,12 @@ def test_python_takes_what_the_command_line_takes(word: str, name: str, value: A
     assert settings.model_dump(mode="json")[group] == expected
 
 
+def test_a_file_of_a_group_that_a_command_does_not_read_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text("defaults: [ip02]\n")
+    done = in_process("finetune", "run=pretrained/medium", "cart=mine.yaml", folder=tmp_path)
+    assert done.complaint == "cartpole-finetune: cart: cartpole-finetune does not read this group"
+
+
 def test_interpolation_in_a_file(tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text("defaults: [ip02]\ncart_mass: ${cart.cart_viscous}\n")
     config = load_settings(TrainConfig, {"cart": tmp_path / "mine.yaml"})

@@ -375,7 +375,7 @@ def cart_on_port(
     numbers = completed(cart)
     lever = lever_um(numbers) if {"cart_mass", "pole_mass", "pole_com"} <= numbers.keys() else LEVER
     bridge = BridgeProcess(plant, hardware, control_period, lever)
-    settings, asked = plant.over(bridge.port), asking(plant, confirm)
+    settings, asked = plant.over(bridge.port), asking(plant, hardware, confirm)
     return SerialPlant(settings, start, control_period, prompt, bridge, confirm, hardware, asked)
 
 

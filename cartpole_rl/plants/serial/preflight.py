@@ -179,7 +179,7 @@ class Probe(ArmedCart):
             raise NotReadyError(
                 f"the cart went {self.metres(state.cart_counts) * 1e3:+.0f} mm, further than any requested "
                 "move",
-                "put the track level, check the motor driver",
+                "put the track level, check the motor driver; of a stepper on plant=text, give plant.damping",
             )
         return state
 
@@ -291,7 +291,8 @@ def cart_direction(probe: Probe) -> str:
     if moved < 0:
         raise NotReadyError(
             f"motor value {value:+d} moves the cart's count down, by {-moved}",
-            "if the cart went right, swap its encoder's wires A and B; if it went left, swap the motor's two",
+            "if the cart went right, swap its encoder's wires A and B, or change plant.cart_reversed; if it "
+            "went left, swap the motor's two, or change the sign of plant.full",
         )
     probe.deadband[RIGHT] = value
     probe.centre()

@@ -17,6 +17,7 @@ from cartpole_rl.plants.serial.errors import fault_words
 from cartpole_rl.plants.serial.link import now
 from cartpole_rl.plants.serial.moves import recentre
 from cartpole_rl.plants.settings import BoardSettings
+from cartpole_rl.rig.hardware import Hardware
 from cartpole_rl.wire.messages import Flags, microseconds_between
 
 LOGGER = logging.getLogger(__name__)
@@ -65,12 +66,12 @@ def always(text: str) -> bool:
     return True
 
 
-def asking(board: BoardSettings, confirm: Confirm) -> Callable[[], None]:
+def asking(board: BoardSettings, hardware: Hardware, confirm: Confirm) -> Callable[[], None]:
     """Return what is done before a board homes: say what it lacks, once, and ask for the cart by hand.
 
     That raises PlantError if nobody confirms.
     """
-    lacks = list(board.lacks)
+    lacks = [f"its board tells no rig; it is taken for one of {hardware.scales_text}", *board.lacks]
 
     def ask() -> None:
         while lacks:
