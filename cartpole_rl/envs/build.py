@@ -11,7 +11,14 @@ from cartpole_rl.checking import validated
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.guard import fitted_guard
 from cartpole_rl.envs.hardware import HardwareTransform
-from cartpole_rl.envs.settings import CartPoleSettings, GuardedPole, ObservationSettings, TrackGuard
+from cartpole_rl.envs.settings import (
+    LONGEST_POLE,
+    CartPoleSettings,
+    GuardedPole,
+    ObservationSettings,
+    TrackGuard,
+)
+from cartpole_rl.errors import ConfigError
 from cartpole_rl.physics.models import Models
 from cartpole_rl.plants.learned import model_and_carts
 from cartpole_rl.plants.settings import LearnedSettings, PlantSettings, SimulationSettings
@@ -73,12 +80,21 @@ def guard_numbers(config: CartPoleSettings, plant: PlantSettings | None = None) 
 
 
 def guarded_pole(config: CartPoleSettings) -> GuardedPole:
-    """Return the poles of `config` as a track guard knows them, without a swing."""
+    """Return the poles of `config` as a track guard knows them, without a swing.
+
+    Raises ConfigError for poles that are too long for one.
+    """
     cart, poles = config.nominal_cart, possible_poles(config.pole)
     density = (
         cart["backdrivability"] / cart["cart_mass"] * fmean(each.pole_mass / each.length for each in poles)
     )
     length = None if config.observation.pole_length else fmean(each.length for each in poles)
+    if length is not None and length > LONGEST_POLE:
+        mean = "" if config.pole.is_single else "mean "
+        raise ConfigError(
+            f"pole={config.pole.name}: its {mean}length is {length:.3g} m (twice pole_com), and a track "
+            f"guard takes at most {LONGEST_POLE:g} m; check pole_com (m), or give guard=none"
+        )
     return GuardedPole(swing=0, density=density, length=length)
 
 

@@ -28,6 +28,7 @@ from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, TaskSetti
 
 POSITIONS = ObservationKind.POSITIONS.mirror_signs
 LARGEST_MARGIN = 0.3  # m, of a track guard: most of half a track
+LONGEST_POLE = 3.0  # m, in a track guard
 
 
 class ObservationSettings(Settings):
@@ -77,7 +78,8 @@ class GuardedPole(Settings):
 
     swing: NonNegative  # share of the way that the swinging pole can move the cart
     density: NonNegative  # 1/m: mass of the pole over its length and over the cart's mass
-    length: Annotated[float, Field(gt=0, le=3)] | None = None  # m; None: as the agent observes it
+    # m; None: as the agent observes it
+    length: Annotated[float, Field(gt=0, le=LONGEST_POLE)] | None = None
 
 
 class TrackGuard(Settings):

@@ -53,6 +53,12 @@ WRONG_TRAINING = [
     ("agent.target_period=10", "agent", "either target_tau or target_period"),
     ("actions.motors=[100,100]", "actions", "two or more different values"),
     ("plant=emulated", "plant=emulated: ", "use cartpole-evaluate for plant=emulated"),
+    (
+        "pole={choices:{mine:{pole_mass:0.5,pole_com:1.6,pole_inertia:0.4}}}",
+        "pole=mine: its length is 3.2 m (twice pole_com)",
+        "at most 3 m; check pole_com (m), or give guard=none",
+    ),
+    ("pole=range pole.lengths=[0.2,6.5]", "pole=0.2 to 6.5 m: its mean length is 3.35 m", "at most 3 m"),
 ]
 
 
