@@ -4,6 +4,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
+from cartpole_rl.errors import ConfigError
 from cartpole_rl.registry import Extension, Registry
 from cartpole_rl.settings import Count, Positive, Settings
 
@@ -29,6 +30,10 @@ AGENTS = Registry("agent", __name__, AgentKind, _check_agent)
 AGENTS.add("dqn", "cartpole_rl.learning.agent:QAgent")
 NETWORKS: Registry[Extension] = Registry("network", __name__)  # functions as `agents.network.q_network`
 NETWORKS.add("mlp", "cartpole_rl.agents.network:q_network")
+
+
+# Control periods: a discount in float32, or an action gap of four digits, is then below 1
+LONGEST_HORIZON, LONGEST_ACTION = 1_000_000, 10_000
 
 
 class AgentSettings(Settings):
@@ -92,3 +97,15 @@ class AgentSettings(Settings):
         if gap is None and self.action_time is not None:
             gap = max(0.0, round(1 - control_period / self.action_time, 4))
         return self.model_copy(update={"gamma": gamma, "action_gap": gap})
+
+    def check(self, control_period: float) -> None:
+        """Raise ConfigError for a new training whose discount or action gap would be all but 1."""
+        for given, name, time, longest, number in (
+            (self.gamma, "horizon", self.horizon, LONGEST_HORIZON, "discount"),
+            (self.action_gap, "action_time", self.action_time, LONGEST_ACTION, "action gap"),
+        ):
+            most = longest * control_period
+            if given is None and time is not None and time > most * (1 + 1e-9):  # a rounded product
+                raise ConfigError(
+                    f"agent.{name}={time:g}: its {number} would be all but 1; give at most {most:g} s"
+                )

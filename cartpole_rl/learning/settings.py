@@ -6,6 +6,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
+from cartpole_rl.errors import ConfigError
 from cartpole_rl.settings import Count, Fraction, NonNegative, Positive, Settings
 
 
@@ -24,9 +25,17 @@ class BufferSettings(Settings):
 
     kind: Literal["prioritized", "uniform"]
     size: Annotated[int, Field(ge=1, le=10**9)]  # transitions
-    alpha: NonNegative  # TorchRL's priority is the squared error, so this acts doubled
+    alpha: Annotated[float, Field(ge=0, le=2)]  # TorchRL's priority is the squared error, so it acts doubled
     beta: tuple[Fraction, Fraction]  # from the first to the last update, linearly
     priority_eps: Positive
+
+    def check(self) -> None:
+        """Raise ConfigError for priorities that a new training would not use."""
+        if self.kind == "prioritized" and self.alpha == 0:
+            raise ConfigError(
+                "buffer.alpha=0: with it, buffer.kind=prioritized draws uniformly; give buffer=prioritized, "
+                "or buffer=uniform"
+            )
 
 
 class OptimizerSettings(Settings):

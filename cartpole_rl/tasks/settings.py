@@ -1,14 +1,16 @@
 """Settings of a task: actions, starts, rewards."""
 
+import math
 from enum import StrEnum
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
+from cartpole_rl.errors import ConfigError
 from cartpole_rl.physics.actuator import ACTUATORS
 from cartpole_rl.physics.laws import Law
 from cartpole_rl.rig.hardware import LARGEST_MOTOR
-from cartpole_rl.settings import Count, Finite, Fraction, NonNegative, Positive, Settings
+from cartpole_rl.settings import Finite, Fraction, NonNegative, Positive, Settings
 from cartpole_rl.tasks.rewards import Reward
 
 Measure = Literal["score", "score_upright"]  # equations (6.2) and (6.1), as in metrics.json
@@ -50,6 +52,15 @@ class StartSettings(Settings):
     resting_share: Fraction = 0.0  # of the episodes start with a hanging pole at rest
     centred_share: Fraction = 0.0  # of these start within CENTRED of the middle, as after homing
 
+    @property
+    def farthest(self) -> tuple[str, float]:
+        """The setting that lets episodes start farthest from upright, with its value, and how far, rad."""
+        if self.angle is not Start.UPRIGHT:
+            return f"angle={self.angle}", math.pi
+        if self.resting_share:
+            return f"resting_share={self.resting_share:g}", math.pi
+        return f"angle_spread={self.angle_spread:g}", min(self.angle_spread, math.pi)
+
 
 class RewardSettings(Settings):
     """The reward: `kind` times `scale`, minus the costs of the track, which the scores do not have."""
@@ -69,15 +80,29 @@ class RewardSettings(Settings):
         return self.model_copy(update={**scaled, "period": None})
 
 
+LONGEST_EPISODE = 3600.0  # s
+MOST_PERIODS = 1_000_000  # of an episode
+
+
+def within_half_turn(angle: float) -> float:
+    """Return `angle`, rad, if it is above 0 and at most pi. Raises ValueError."""
+    if not 0 < angle <= math.pi:
+        meant = f"{angle:g} degrees are {math.radians(angle):.4g}" if 0 < angle <= 180 else "or null"
+        raise ValueError(f"give rad, above 0 and at most pi; {meant}")
+    return angle
+
+
 class TaskSettings(Settings):
     """The task."""
 
     name: str
     start: StartSettings  # of training episodes
     evaluation_start: StartSettings
-    duration: Positive | None = None  # s, of an episode; missing in checkpoints of earlier versions
-    time_limit: Count | None = None  # or its length in control periods, which takes precedence
-    angle_limit: Finite | None  # rad; None: the pole may hang
+    # s, of an episode; missing in checkpoints of earlier versions
+    duration: Annotated[float, Field(gt=0, le=LONGEST_EPISODE)] | None = None
+    # or its length in control periods, which takes precedence
+    time_limit: Annotated[int, Field(ge=1, le=MOST_PERIODS)] | None = None
+    angle_limit: Annotated[Finite, AfterValidator(within_half_turn)] | None  # rad; None: the pole may hang
     x_max: Positive  # m, of (5.4), (6.1), (6.2)
 
     @model_validator(mode="after")
@@ -85,6 +110,19 @@ class TaskSettings(Settings):
         if self.duration is None and self.time_limit is None:
             raise ValueError("give duration (s), or time_limit (control periods)")
         return self
+
+    def check_starts(self) -> None:
+        """Raise ConfigError if episodes of a new training would end as they start."""
+        if self.angle_limit is None:
+            return
+        for name, start in (("start", self.start), ("evaluation_start", self.evaluation_start)):
+            setting, angle = start.farthest
+            if angle > self.angle_limit:
+                raise ConfigError(
+                    f"task.{name}.{setting}: episodes would start up to {angle:.3g} rad from upright, and "
+                    f"end at once beyond task.angle_limit={self.angle_limit:.3g}; give start angles within "
+                    "it, or task.angle_limit=null"
+                )
 
     @property
     def periods(self) -> int:

@@ -156,7 +156,13 @@ class TrainConfig(RunSettings, CartPoleSettings):
         return self
 
     def check_learning(self) -> None:
-        """Raise ConfigError for a new training that would learn nothing, or use shorter returns."""
+        """Raise ConfigError for a new training that would learn nothing, or otherwise than its settings say.
+
+        The settings of an earlier training may be any of these.
+        """
+        self.agent.check(self.control_period)
+        self.buffer.check()
+        self.task.check_starts()
         learning = self.learning.at(self.control_period)
         if self.buffer.size < (collected := learning.carts * learning.chunk):
             raise ConfigError(

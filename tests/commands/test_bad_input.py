@@ -59,6 +59,38 @@ WRONG_TRAINING = [
         "at most 3 m; check pole_com (m), or give guard=none",
     ),
     ("pole=range pole.lengths=[0.2,6.5]", "pole=0.2 to 6.5 m: its mean length is 3.35 m", "at most 3 m"),
+    (
+        "agent.action_time=500",
+        "agent.action_time=500: its action gap would be all but 1",
+        "give at most 200 s",
+    ),
+    (
+        "agent.horizon=1e17",
+        "agent.horizon=1e+17: its discount would be all but 1",
+        "give at most 20000 s",
+    ),
+    ("buffer.alpha=100", "buffer.alpha=100: ", "give at most 2"),
+    ("buffer.alpha=0", "buffer.alpha=0: with it, buffer.kind=prioritized draws uniformly", "buffer=uniform"),
+    ("buffer=uniform buffer.kind=prioritized", "buffer.alpha=0: with it", "give buffer=prioritized, or"),
+    ("task.duration=1e20", "task.duration=1e+20: ", "give at most 3600 s"),
+    ("task.time_limit=100000000000000000000", "task.time_limit=1000", "give at most 1000000"),
+    ("task.angle_limit=-1", "task.angle_limit=-1: ", "give rad, above 0 and at most pi; or null"),
+    ("task.angle_limit=12", "task.angle_limit=12: ", "at most pi; 12 degrees are 0.2094"),
+    (
+        "task=balance task.start.angle_spread=3.0",
+        "task.start.angle_spread=3: episodes would start up to 3 rad from upright",
+        "beyond task.angle_limit=0.209; give start angles within it, or task.angle_limit=null",
+    ),
+    (
+        "task=balance task.evaluation_start.angle=hanging",
+        "task.evaluation_start.angle=hanging: episodes would start up to 3.14 rad",
+        "task.angle_limit=null",
+    ),
+    (
+        "task=balance task.start.resting_share=0.1",
+        "task.start.resting_share=0.1: episodes would start up to 3.14 rad",
+        "task.angle_limit=null",
+    ),
 ]
 
 

@@ -2,6 +2,7 @@
 
 import http.client
 import json
+import math
 import os
 import signal
 import subprocess
@@ -201,7 +202,7 @@ def test_a_training_shows_the_first_episode_of_each_evaluation(
 
     monkeypatch.setattr(WebView, "add", added)
     toy = {**TOY[TrainConfig], "learning.evaluations": 2, "task.time_limit": 50, "view": "web"}
-    toy |= {"task.angle_limit": 10.0}  # it judges by score_upright
+    toy |= {"task.angle_limit": math.pi}  # it judges by score_upright
     train(load_settings(TrainConfig, toy), tmp_path / "run")
     history = [json.loads(line) for line in (tmp_path / "run/history.jsonl").read_text().splitlines()]
     assert [each["name"] for each in shown] == [
