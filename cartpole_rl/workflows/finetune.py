@@ -75,7 +75,7 @@ from cartpole_rl.workflows.build import (
 from cartpole_rl.workflows.checks import check_finetuning, check_resumable, check_tools
 from cartpole_rl.workflows.config import EvaluateConfig, FinetuneConfig, TrainConfig, recorded_settings
 from cartpole_rl.workflows.finetuning_cart import FinetuningCart, FinetuningFiles, Stage, yielding_to
-from cartpole_rl.workflows.finetuning_learner import CartLearner, TunedAgent, check_simulation
+from cartpole_rl.workflows.finetuning_learner import CartLearner, TunedAgent, check_simulation, check_warmup
 from cartpole_rl.workflows.poles import other_pole, plant_words
 from cartpole_rl.workflows.ray_learner import LearnerTask, Offer
 from cartpole_rl.workflows.ray_link import LearnerLink
@@ -127,6 +127,8 @@ def finetune(config: FinetuneConfig, folder: Path, words: Sequence[str] = ()) ->
     notes = other_pole(agent.known_poles, settings.pole, emulated), guard_note(training, evaluation, settings)
     for note in filter(None, notes):
         show(note)
+    if not checkpoint:
+        check_warmup(config, training)
     if not isinstance(config.learner, RayLearnerSettings):  # whose machine has the files
         check_simulation(training)
     with claimed(folder):
@@ -249,9 +251,9 @@ def link_to_learner(
 def learn_here(cart: FinetuningCart, tuned: TunedAgent, settings: CartPoleSettings) -> None:
     """Drive and learn at the same time, episode by episode; what is on disk is not driven again."""
     files, config, learned = cart.files, cart.config, tuned.learned
-    learner = CartLearner(config, tuned.training, settings, tuned.agent)
     if learned >= config.episodes:
         return
+    learner = CartLearner(config, tuned.training, settings, tuned.agent)
     recorded = files.learned_from()[: config.evaluation_episodes + learned]
     if "replay" in tuned.state:
         learner.restore(recorded, tuned.state)

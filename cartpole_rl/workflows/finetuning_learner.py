@@ -14,10 +14,11 @@ import numpy as np
 import torch
 from tensordict import TensorDictBase
 
-from cartpole_rl.envs.build import environment, randomizer, simulated_env
+from cartpole_rl.choices import choice
+from cartpole_rl.envs.build import driven_carts, environment, simulated_env
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.envs.settings import CartPoleSettings
-from cartpole_rl.errors import CheckpointError, RecordingError
+from cartpole_rl.errors import CheckpointError, ConfigError, RecordingError
 from cartpole_rl.evaluation.driving_policy import Weights, as_weights
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.identification.fit import best_fit
@@ -32,7 +33,7 @@ from cartpole_rl.learning.checkpoints import (
     whole_state,
 )
 from cartpole_rl.learning.dqn import COLLECTED, Monitor, Scalars, Training, n_step_transitions
-from cartpole_rl.learning.settings import FinetuningSettings, LearningSettings
+from cartpole_rl.learning.settings import BufferSettings, FinetuningSettings, LearningSettings
 from cartpole_rl.physics.friction import CART_FRICTIONS
 from cartpole_rl.physics.models import Models
 from cartpole_rl.plants.recorded import RecordedPlant
@@ -220,7 +221,7 @@ class CartLearner:
     ) -> None:
         self.config, self.training, self.settings, self.agent = config, training, settings, agent
         self.show = show
-        models = training.models(training.plant)
+        self.trained_carts, models = driven_carts(training, training.plant)
         self.candidates = [models]  # physics models to fit; those of the first fit alone, once there is one
         if models.cart_friction == "sigmoid":
             self.candidates.append(models._replace(cart_friction=CART_FRICTIONS.find("step")))
@@ -237,7 +238,7 @@ class CartLearner:
             self.is_fitted = False
             self.show(f"the simulator is not fitted yet, its carts are drawn as in training: {error}")
             models, random = self.candidates[0], torch.Generator().manual_seed(self.config.seed)
-            self.carts = randomizer(self.training).draw(SAMPLES, random)
+            self.carts = self.trained_carts.draw(SAMPLES, random)
         self.prepare(recorded, models)
         self.loop.iteration = learned * self.config.finetuning.iterations
         self.loop.fill()
@@ -321,7 +322,7 @@ class CartLearner:
         return Finetuning(
             finetuning,
             simulated_learning(training.learning.at(training.control_period), finetuning, config.episodes),
-            training.buffer.model_copy(update={"kind": finetuning.buffer_kind}),
+            simulated_buffer(training.buffer, finetuning),
             training.optimizer.model_copy(update={"learning_rate": finetuning.learning_rate}),
             self.agent,
             environment(guarded, plant),
@@ -348,8 +349,8 @@ class CartLearner:
 
     def randomizer(self) -> IdentifiedCarts:
         """Return the randomizer of the simulated carts: of the newest fit, and a share of the prior."""
-        prior, share = randomizer(self.training), self.config.finetuning.prior_share
-        return IdentifiedCarts(self.carts, prior, share, LONGEST_LATENCY)
+        share = self.config.finetuning.prior_share
+        return IdentifiedCarts(self.carts, self.trained_carts, share, LONGEST_LATENCY)
 
     def transitions(self, episode: Episode) -> list[Any]:
         """Return an episode's transitions in chunks, as the agent observes them."""
@@ -373,9 +374,31 @@ class CartLearner:
         return float(np.mean([each.total(measure) for each in run_batch(env, self.agent.greedy_policy())]))
 
 
+def check_warmup(config: FinetuneConfig, training: TrainConfig) -> None:
+    """Raise ConfigError for a fine-tuning that would learn nothing."""
+    learning = training.learning.at(training.control_period)
+    warmup = config.finetuning.warmup_transitions
+    simulated = simulated_learning(learning, config.finetuning, config.episodes).collected_transitions
+    if warmup >= simulated:
+        raise ConfigError(
+            f"finetuning.warmup_transitions={warmup}: nothing would be learned, as this run simulates "
+            f"{simulated} transitions after it has filled the buffer; give fewer, or more episodes"
+        )
+
+
 def check_simulation(training: TrainConfig) -> None:
     """Raise CartPoleError if a file that the simulation of the training reads is missing or damaged."""
     simulated_env(training, training.plant, 1, training.task.start, training.seed)
+
+
+def simulated_buffer(buffer: BufferSettings, finetuning: FinetuningSettings) -> BufferSettings:
+    """Return the settings of the buffer of a fine-tuning: those of the training, with the kind chosen for it.
+
+    Priorities that a training without them leaves at alpha 0 are those of conf/buffer/prioritized.yaml.
+    """
+    if finetuning.buffer_kind == "uniform" or buffer.alpha > 0:
+        return buffer.model_copy(update={"kind": finetuning.buffer_kind})
+    return BufferSettings(**{**choice("buffer/prioritized"), "size": buffer.size})
 
 
 def simulated_learning(

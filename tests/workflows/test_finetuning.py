@@ -15,13 +15,18 @@ from short_episode import FULL as BROKEN
 
 from cartpole_rl.choices import choice
 from cartpole_rl.envs.build import simulated_env
-from cartpole_rl.errors import CheckpointError, LinkError, RecordingError
+from cartpole_rl.errors import CheckpointError, ConfigError, LinkError, RecordingError
 from cartpole_rl.evaluation.driver import EpisodeRequest, Result
 from cartpole_rl.evaluation.episodes import run_batch
 from cartpole_rl.files import write_bytes
 from cartpole_rl.learning.checkpoints import FINETUNING_FORMAT, AgentCheckpoint, load_training, save_agent
-from cartpole_rl.learning.settings import FinetuningSettings, LearningSettings
+from cartpole_rl.learning.settings import BufferSettings, FinetuningSettings, LearningSettings
 from cartpole_rl.learning.states import seed_everything
+from cartpole_rl.physics.friction import CART_FRICTIONS
+from cartpole_rl.physics.models import Models
+from cartpole_rl.physics.parameters import CartParameters
+from cartpole_rl.physics.residual import Residual
+from cartpole_rl.plants.learned import LearnedModel, save_model
 from cartpole_rl.plants.serial.tracking import LinkStatistics
 from cartpole_rl.reporting.tensorboard import TensorBoardLog, scalars
 from cartpole_rl.run_folder import file_hash, recorded_provenance, write_config
@@ -30,7 +35,12 @@ from cartpole_rl.workflows.build import evaluated_settings, new_agent
 from cartpole_rl.workflows.config import FinetuneConfig, TrainConfig, load_settings, recorded_settings
 from cartpole_rl.workflows.finetune import evaluation_config, finetune, overlaid, started_from
 from cartpole_rl.workflows.finetuning_cart import FinetuningCart, FinetuningFiles, Stage
-from cartpole_rl.workflows.finetuning_learner import CartLearner, TunedAgent, simulated_learning
+from cartpole_rl.workflows.finetuning_learner import (
+    CartLearner,
+    TunedAgent,
+    simulated_buffer,
+    simulated_learning,
+)
 
 TRAINING = {
     "task.time_limit": 60,
@@ -233,10 +243,45 @@ def test_learning_in_simulation_follows_the_settings() -> None:
     assert simulated.batch_size == learning.batch_size
 
 
-def new_learner() -> CartLearner:
-    """A learner with a new agent, the same one each time; its cart brakes later than that of the training."""
+@pytest.mark.parametrize(("warmup", "learns"), [(4 * 3 * 16 * 8 - 1, True), (4 * 3 * 16 * 8, False)])
+def test_a_fine_tuning_that_would_learn_nothing_is_refused(
+    warmup: int, learns: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before the cart moves, and before a file is written; the buffer is filled before these transitions."""
+    training, run, driven = load_settings(TrainConfig, TRAINING), tmp_path / "agent.pt", list[bool]()
+    agent = AgentCheckpoint(training.model_dump(mode="json"), new_agent(training).state_dict(), 10, None)
+    save_agent(run, agent)
+    monkeypatch.setattr("cartpole_rl.workflows.finetune.drive_all", lambda *_: driven.append(True))
+    config = load_settings(
+        FinetuneConfig, {**CONFIG, "run": str(run), "finetuning.warmup_transitions": warmup}
+    )
+    complaint = r"^finetuning\.warmup_transitions=1536: nothing would be learned, as .* 1536 transitions "
+    with nullcontext() if learns else pytest.raises(ConfigError, match=complaint):
+        finetune(config, tmp_path / "run")
+    assert bool(driven) == (tmp_path / "run").exists() == learns
+
+
+def test_priorities_of_simulated_transitions_have_an_effect() -> None:
+    """A training with buffer=uniform leaves alpha at 0; another one keeps its numbers."""
+    gentle = choice("finetuning/gentle") | {"cart_share": 0.0}
+    prioritized = FinetuningSettings(**gentle | {"buffer_kind": "prioritized"})
+    uniform = BufferSettings(**choice("buffer/uniform") | {"size": 5000})
+    own = BufferSettings(**choice("buffer/prioritized") | {"alpha": 0.5, "size": 5000})
+    given = choice("buffer/prioritized") | {"size": 5000}
+    assert simulated_buffer(uniform, prioritized) == BufferSettings(**given)
+    assert simulated_buffer(own, prioritized) == own
+    assert simulated_buffer(own, FinetuningSettings(**gentle)) == own.model_copy(update={"kind": "uniform"})
+    assert simulated_buffer(uniform, FinetuningSettings(**gentle)) == uniform
+
+
+def new_learner(**changes: Any) -> CartLearner:
+    """A learner with a new agent, the same one each time; its cart brakes later than that of the training.
+
+    `changes` are of the training's settings.
+    """
     seed_everything(3)
-    training, config = load_settings(TrainConfig, TRAINING), load_settings(FinetuneConfig, CONFIG)
+    training = load_settings(TrainConfig, TRAINING | changes)
+    config = load_settings(FinetuneConfig, CONFIG)
     settings = evaluated_settings(training, evaluation_config(config))
     numbers = settings.guard.active
     other = numbers.model_copy(update={"margin": 2 * numbers.margin})
@@ -349,6 +394,25 @@ def test_learning_begins_without_a_fit_and_takes_a_later_one(
     assert learner.loop.env.plant.models == learner.models == learner.candidates[0]
     assert learner.snapshot()["cart_friction"] == "step"
     assert learner.loop.iteration == iteration
+
+
+def test_the_carts_of_a_training_on_a_learned_model_are_those_of_the_model(
+    recorded: list[Episode], tmp_path: Path
+) -> None:
+    """With its friction law: where no cart can be fitted, and in the prior share of a fit."""
+    training = load_settings(TrainConfig, TRAINING)
+    identified = training.nominal_with(training.pole.nominal) | {"cart_mass": 1.3, "latency": 0.03}
+    residual = Residual.untrained(3, 8, torch.Generator().manual_seed(0), 0.02, 4.0, 0.814)
+    models = Models(cart_friction=CART_FRICTIONS.find("step"))
+    save_model(tmp_path / "model.pt", LearnedModel(identified, models, 0.02, 4, residual))
+    learner = new_learner(plant={"kind": "learned", "model": str(tmp_path), "prior_share": 0.0})
+    learner.start([recorded[0].part(0, 9)])
+    drawn, rows = learner.randomizer().prior.draw(9, torch.Generator()), CartParameters.names()
+    for name in ("cart_mass", "latency"):
+        for carts in (learner.carts, drawn):
+            assert torch.equal(carts[rows.index(name)].unique(), torch.tensor([identified[name]]))
+    assert learner.models == learner.candidates[0] == models
+    assert learner.snapshot()["cart_friction"] == "step"
 
 
 def test_what_is_not_learned_from_is_told(
