@@ -386,7 +386,12 @@ def precedence(plant: PlantSettings, emulator: EmulatorSettings) -> AbstractCont
     return taking_precedence() if plant.is_real_time(emulator) else nullcontext()
 
 
+THREADS = {"own": 0, "used": 0}  # torch's threads without `use_threads`, and those that it set last
+
+
 def use_threads(threads: int | None) -> None:
-    """Set the number of torch's threads; None keeps torch's own choice."""
-    if threads is not None:
-        torch.set_num_threads(threads)
+    """Set the number of torch's threads; None gives back the number before an earlier job in this process."""
+    if (present := torch.get_num_threads()) != THREADS["used"]:  # torch's own choice, or its user's
+        THREADS["own"] = present
+    THREADS["used"] = THREADS["own"] if threads is None else threads
+    torch.set_num_threads(THREADS["used"])
