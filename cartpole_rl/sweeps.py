@@ -1,8 +1,10 @@
 """Folders of runs and of the jobs of sweeps, and what becomes of jobs that fail.
 
-A wrong setting of any job ends a sweep before it starts; a failed job does not end one. The end of a sweep
-names every failed job with the reason. Each job keeps error.txt in its run folder until it succeeds. So the
-report is the same with every launcher, and it includes jobs that were killed.
+A sweep ends before it starts if a setting of any job has a wrong name, type or range, or if a training would
+learn nothing (`TrainConfig.check_learning`). Other checks, as of files and carts, are those of the job: a
+failed job does not end a sweep. The end of a sweep names every failed job with the reason. Each job keeps
+error.txt in its run folder until it succeeds. So the report is the same with every launcher, and it includes
+jobs that were killed.
 """
 
 import logging
@@ -148,7 +150,12 @@ def check_folder(config: DictConfig, folder: Path) -> None:
 
 
 def check_jobs(config: DictConfig, schema: type[Settings]) -> None:
-    """Raise for the first job of a sweep with a wrong setting, unless its sweeper chooses while it runs."""
+    """Raise for the first job of a sweep with a wrong setting, unless its sweeper chooses while it runs.
+
+    What a job reads or compiles is checked where it runs.
+    """
+    from cartpole_rl.workflows.config import TrainConfig  # a command without a sweep may need none of it
+
     for job in jobs_of(config):
         composed = GlobalHydra.instance().config_loader().load_sweep_config(config, job)
         with read_write(composed), open_dict(composed):
@@ -157,7 +164,9 @@ def check_jobs(config: DictConfig, schema: type[Settings]) -> None:
             raise ConfigError(
                 f"resume= continues one run; call {program(SweepStart.command)} once for each, without -m"
             )
-        validated(schema, as_mapping(composed))
+        checked = validated(schema, as_mapping(composed))
+        if isinstance(checked, TrainConfig):
+            checked.check_learning()
 
 
 def jobs_of(config: DictConfig) -> list[list[str]]:

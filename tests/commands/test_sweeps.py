@@ -58,6 +58,8 @@ def test_a_sweep_is_as_its_words_after_dash_m(tmp_path: Path) -> None:
         ("-m seeed=0,1", "seeed: there is no such setting; did you mean seed?"),
         ("sweep=seeds agent.gamma=1.5", "agent.gamma=1.5: give less than 1"),
         ("-m learning.transitions=1000000,100", "learning.transitions=100 is too few"),
+        ("-m learning.warmup_transitions=1000,99999999", "learning.transitions=4000000: nothing would be"),
+        ("-m buffer=uniform buffer.kind=uniform,prioritized", "buffer.alpha=0: with it, buffer.kind=prior"),
         ("-m resume=a,b", "resume= continues one run; call cartpole-train once for each, without -m"),
     ],
 )
