@@ -223,8 +223,24 @@ class Link:
                 f"every {LEARNER} of the Ray cluster is busy with another fine-tuning, or with one that was "
                 "interrupted within the last hour; this one waits"
             )
-        options = {"name": name, "lifetime": "detached", "get_if_exists": True, "num_cpus": 0}
+        return self.named_learner()
+
+    def named_learner(self) -> Any:
+        """Return the learner with the name of this run, a new one if there is none."""
+        import ray
+
+        options = {"name": self.task.name, "lifetime": "detached", "get_if_exists": True, "num_cpus": 0}
         return ray.remote(Learner).options(**options, resources={LEARNER: 1}).remote(self.task)
+
+    def replaced(self, learner: Any) -> Any:
+        """End a learner with an episode that is no longer on disk; return one that starts from the task."""
+        import ray
+
+        self.pipe.send("a recording was moved away since: a new learner starts, from the episodes on disk")
+        ray.kill(learner)
+        while self.task.name in ray.util.list_named_actors():  # it is ending
+            time.sleep(PERIOD)
+        return self.named_learner()
 
     def exchange(self, learner: Any, node: "subprocess.Popen[bytes]") -> None:
         """Send the learner each episode on disk, and the session the learner's news.
@@ -234,7 +250,7 @@ class Link:
         """
         import ray
 
-        arrived, episodes, patience = 0, list[Episode](), FIRST_CONNECTION
+        arrived, episodes, patience, is_first = 0, list[Episode](), FIRST_CONNECTION, True
         while node.poll() is None:
             try:
                 answer = ray.get(learner.exchange.remote(self.taken, arrived, episodes), timeout=patience)
@@ -245,8 +261,11 @@ class Link:
                 died = isinstance(error, ray.exceptions.ActorDiedError)
                 reason = "its process ended" if died else "the connection broke"
                 raise ConnectionError(f"{reason}, see {LOG}") from None
-            self.answered.value, patience = time.monotonic(), self.settings.timeout
             taken, news, arrived = answer
+            if is_first and arrived and not self.episodes(arrived - 1):  # of a run that is resumed
+                learner, arrived = self.replaced(learner), 0
+                continue
+            self.answered.value, patience, is_first = time.monotonic(), self.settings.timeout, False
             if news:
                 self.pipe.send((taken, news))
                 self.taken = taken

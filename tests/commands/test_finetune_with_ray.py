@@ -10,8 +10,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from command_line import FINETUNING, Outcome, in_process
+from command_line import FINETUNING, Outcome, in_process, interrupt_after
 
+from cartpole_rl.learning.checkpoints import FINETUNING_FORMAT, load_training
+from cartpole_rl.workflows.finetune import NAME
 from cartpole_rl.workflows.ray_link import SETTINGS
 
 
@@ -72,3 +74,39 @@ def test_an_address_without_a_cluster_is_refused_before_the_cart_moves(trained: 
     assert done.code == 1
     assert f"learner.address={address} does not answer (Connection refused); start Ray on its" in done.err
     assert not (tmp_path / "run/recordings").exists()
+
+
+PUSH = """
+import sys
+from pathlib import Path
+import ray
+from cartpole_rl.evaluation.recordings import read_recording
+from cartpole_rl.workflows.ray_learner import Taken
+from cartpole_rl.workflows.ray_link import joined
+
+address, name, recording = sys.argv[1:]
+with joined(address):
+    learner = ray.get_actor(name)
+    taken, _, arrived = ray.get(learner.exchange.remote(Taken(), 0, []))
+    episodes = [read_recording(Path(recording)).episode] * (3 - arrived)
+    assert ray.get(learner.exchange.remote(taken, arrived, episodes))[2] == 3
+"""
+
+
+@pytest.mark.nightly
+def test_a_learner_with_an_episode_that_was_moved_away_is_replaced(
+    trained: Path, tuned: tuple[Path, Outcome], head: tuple[str, "subprocess.Popen[bytes]"], tmp_path: Path
+) -> None:
+    """A session was interrupted after its first episode to learn from, and its learner has one more."""
+    run, alone = tmp_path / "run", tuned[0]
+    words = (*FINETUNING, "learner=ray", f"learner.address={head[0]}", "hydra.run.dir=run")
+    interrupt_after(run / "recordings/tune_000.csv")
+    assert in_process("finetune", f"run={trained}", *words, folder=tmp_path).code == 130
+    name = load_training(run, FINETUNING_FORMAT).state[NAME]
+    push = [sys.executable, "-c", PUSH, head[0], name, str(run / "recordings/tune_000.csv")]
+    subprocess.run(push, check=True, env={**os.environ, **SETTINGS})
+    done = in_process("finetune", "resume=run", folder=tmp_path)
+    assert done.code == 0, done.err
+    assert "a recording was moved away since: a new learner starts" in done.err
+    expected, found = (sorted(path.name for path in each.glob("recordings/*")) for each in (alone, run))
+    assert found == expected

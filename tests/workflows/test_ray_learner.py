@@ -3,11 +3,14 @@
 The process of the link and the learner are made up; tests/commands/test_finetune_with_ray.py has a cluster.
 """
 
+import itertools
 import os
 import socket
+import sys
 import time
 from collections.abc import Callable
 from contextlib import nullcontext, suppress
+from functools import partial
 from multiprocessing import Pipe
 from pathlib import Path
 from threading import Thread
@@ -30,7 +33,13 @@ from cartpole_rl.workflows.finetune import NAME, learn_there, take
 from cartpole_rl.workflows.finetuning_cart import FinetuningFiles, Stage
 from cartpole_rl.workflows.finetuning_learner import TunedAgent
 from cartpole_rl.workflows.ray_learner import Curves, Learner, Offer, Taken
-from cartpole_rl.workflows.ray_link import LearnerLink, check_address, check_versions, version_finder
+from cartpole_rl.workflows.ray_link import (
+    LearnerLink,
+    Link,
+    check_address,
+    check_versions,
+    version_finder,
+)
 
 TRAINING = load_settings(TrainConfig, {"agent.hidden": [8, 8]})
 SETTINGS = RayLearnerSettings(kind="ray", address="server:6379", episodes_ahead=2, timeout=10.0)
@@ -330,6 +339,66 @@ def test_a_learner_takes_each_episode_once_and_repeats_no_news(monkeypatch: pyte
     assert learner.exchange(taken, 0, episodes) == (taken, [], 3)
     assert learner.exchange(Taken("another", 5), 3, []) == (taken, ["fitted"], 3)
     assert [episode.steps for episode in learner.first(3)] == [2, 1, 0]
+
+
+class Ray:
+    """What a link calls of Ray, in this process; a learner that ends keeps its name for `ending` looks."""
+
+    exceptions = SimpleNamespace(GetTimeoutError=TimeoutError, RayActorError=OSError, ActorDiedError=OSError)
+
+    def __init__(self, ending: int) -> None:
+        self.killed, self.ending, self.util = list[Any](), ending, self
+
+    def get(self, called: Callable[[], Any], timeout: float) -> Any:
+        return called()
+
+    def kill(self, learner: Any) -> None:
+        self.killed.append(learner)
+
+    def list_named_actors(self) -> list[str]:
+        self.ending -= 1
+        return ["run"] if self.ending >= 0 else []
+
+
+def handle(learner: Learner) -> Any:
+    """A learner as the link calls it."""
+    return SimpleNamespace(exchange=SimpleNamespace(remote=lambda *given: partial(learner.exchange, *given)))
+
+
+@pytest.mark.parametrize("moved", [True, False])
+def test_a_learner_with_an_episode_that_was_moved_away_is_replaced(
+    moved: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By one that gets the episode that is driven again; until it answers, the cart is not driven."""
+    monkeypatch.setattr(Learner, "_tune", lambda learner: None)
+    monkeypatch.setattr(ray_link, "PERIOD", 0.0)
+    monkeypatch.setitem(sys.modules, "ray", ray := Ray(ending=2))
+    learners = [Learner(SimpleNamespace()) for _ in range(2)]
+    for version, learner in enumerate(learners):
+        learner.news.append(Offer(version, {}))
+    handles, disk = [*map(handle, learners)], [EPISODE.part(0, steps) for steps in (2, 1, 0)]
+    learners[0].exchange(Taken(), 0, disk)
+    del disk[3 - moved :]
+    session, end = Pipe()
+    link = Link(end, SimpleNamespace(value=0.0), SETTINGS, lambda first: disk[first:], None, Taken())
+    link.task = SimpleNamespace(name="run")
+
+    def start() -> Any:
+        assert (link.answered.value, ray.ending, ray.killed) == (0, -1, handles[:1])
+        return handles[1]
+
+    monkeypatch.setattr(link, "named_learner", start)
+    looks = itertools.count()
+    happens = {3: lambda: disk.append(EPISODE), 6: lambda: session.send("finish")}
+    link.exchange(handles[0], SimpleNamespace(poll=lambda: happens.get(next(looks), lambda: None)()))
+    assert link.answered.value > 0
+    assert ray.killed == handles[: 1 + moved]
+    assert learners[moved].episodes == disk
+    told = [session.recv() for _ in range(1 + moved)]
+    assert told[-1] == (Taken(learners[moved].name, 1), [Offer(int(moved), {})])
+    line = "a recording was moved away since: a new learner starts, from the episodes on disk"
+    assert told[:-1] == [line] * moved
+    assert not session.poll()
 
 
 def test_a_learning_that_fails_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
