@@ -83,6 +83,13 @@ def exit_after_signal(name: str, signalled: BaseException) -> NoReturn:
     sys.exit(SIGNALLED + number)
 
 
+def signal_behind(error: BaseException | None) -> BaseException | None:
+    """Return what a signal raised, if `error` follows from it, as the error of an interrupted import."""
+    while error is not None and not isinstance(error, KeyboardInterrupt | Terminated):
+        error = error.__cause__ or error.__context__
+    return error
+
+
 def catch_signals() -> None:
     """Make SIGTERM, SIGHUP and SIGINT raise, except for those that the parent process ignores."""
     handler = RaiseOnce(lambda number: KeyboardInterrupt() if number == signal.SIGINT else Terminated(number))

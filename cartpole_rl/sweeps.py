@@ -37,7 +37,7 @@ from cartpole_rl.composition import (
     task_overrides,
 )
 from cartpole_rl.errors import CartPoleError, ConfigError
-from cartpole_rl.exits import OF_HYDRA, exit_with_message, is_defect, one_line
+from cartpole_rl.exits import OF_HYDRA, exit_with_message, is_defect, one_line, signal_behind
 from cartpole_rl.files import write_text
 from cartpole_rl.run_folder import CONFIG, ERROR, MULTIRUN
 from cartpole_rl.settings import Settings
@@ -221,6 +221,8 @@ def run_as_job(name: str, folder: Path, work: Callable[[], float | None]) -> flo
     try:
         result = work()
     except Exception as error:
+        if (signalled := signal_behind(error)) is not None:
+            raise signalled from None
         print_message(name, reason := one_line(error, name))
         details = traceback.format_exc() if is_defect(error) else ""
         write_text(folder / ERROR, f"{reason}\n{details}")
