@@ -1,10 +1,9 @@
 """Every command of the pages in docs/ is one that the package takes: names, groups, keys and options exist.
 
-The README's commands are run by test_readme.py, those of the guides by test_guides.py, those of
-docs/extending.md by test_extending.py, the Python blocks by workflows/test_python_api.py,
-test_your_own_code.py and envs/test_torchrl_example.py. Here are those that need an extra, whose settings are
-composed, and scripts that take hours: their options exist. What a Python block imports exists. No block is
-left out.
+The commands of the README and the guides are run by test_guides.py, those of docs/extending.md by
+test_extending.py, the Python blocks by workflows/test_python_api.py, test_your_own_code.py and
+envs/test_torchrl_example.py. Here are those that need an extra, whose settings are composed, and scripts that
+take hours: their options exist. What a Python block imports exists. No block is left out.
 """
 
 import ast
