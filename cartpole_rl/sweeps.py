@@ -1,7 +1,7 @@
 """Folders of runs and of the jobs of sweeps, and what becomes of jobs that fail.
 
-A sweep ends before it starts if a setting of any job has a wrong name, type or range, or if a training would
-learn nothing (`TrainConfig.check_learning`). Other checks, as of files and carts, are those of the job: a
+A sweep ends before it starts if a setting of any job has a wrong name, type or range, or for a training that
+`TrainConfig.check_learning` refuses. Other checks, as of files and carts, are those of the job: a
 failed job does not end a sweep. The end of a sweep names every failed job with the reason. Each job keeps
 error.txt in its run folder until it succeeds. So the report is the same with every launcher, and it includes
 jobs that were killed.

@@ -202,13 +202,13 @@ class HardwareTransform(Transform):
 
 
 def finite_actions(action: Tensor, *numbers: Tensor | None) -> Tensor:
-    """Return the actions [N]; NO_ACTION where a row of one of the `numbers` [N, K] is not finite.
+    """Return the actions [N]; NO_ACTION where a row of one of the `numbers` [N, ...] is not finite.
 
     The argmax of NaN values is the first action, full motor to the left.
     """
     for each in numbers:
         if each is not None:
-            action = action.where(each.isfinite().all(-1), NO_ACTION)
+            action = action.where(each.isfinite().flatten(1).all(1), NO_ACTION)
     return action
 
 

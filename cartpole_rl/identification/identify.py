@@ -26,7 +26,7 @@ from cartpole_rl.tasks.episode import Ending, Episode
 
 Array = NDArray[np.floating]
 HORIZON = 1.0  # s of motion, predicted
-FEW = 5  # stretches whose median is no error to rely on
+FEW = 4  # stretches; the median of fewer is no error to rely on
 MOVING = 0.02  # m in that time, from which a friction model shows
 COARSE_STEPS = 4  # integration steps a period when friction models are compared
 CONTENDS = 1.5  # a screened model stays a candidate up to this multiple of the best one's error

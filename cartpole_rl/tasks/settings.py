@@ -80,8 +80,8 @@ class RewardSettings(Settings):
         return self.model_copy(update={**scaled, "period": None})
 
 
-LONGEST_EPISODE = 3600.0  # s
-MOST_PERIODS = 1_000_000  # of an episode
+LONGEST_EPISODE = 86_400.0  # s
+MOST_PERIODS = 20_000_000  # of an episode
 
 
 def within_half_turn(angle: float) -> float:

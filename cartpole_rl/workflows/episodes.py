@@ -102,7 +102,7 @@ class Evaluation:
             print_message(command, warning)
         if note := guard_note(self.training, self.config, self.settings):
             print_message(command, note)
-        if "cart" not in plant.ignored:
+        if not plant.is_on_port:
             note_other_numbers(command, self.settings.nominal_cart, (poles.choices or {}).values())
 
     def check_board(self) -> None:

@@ -318,8 +318,8 @@ def _scale_doubts(sensors: Sensors, layout: Layout, jump: float) -> Iterator[str
     elif zero is not None and not zero.holds(0, ANGLE_ZERO):
         value, low, high = recorded_angle(zero, layout)
         yield (
-            f"the pole is upright where {layout.angle.name} is {value:.5g} (95 %: {low:.5g} to {high:.5g}), "
-            f"not {layout.angle.upright:.5g}: give it as layout.angle.upright"
+            f"the pole is upright where {layout.angle.name} is {value:.7g} (95 %: {low:.7g} to {high:.7g}), "
+            f"not {layout.angle.upright:.7g}: give it as layout.angle.upright"
         )
     if position is not None and scale is not None and not position.holds(1, POSITION_SCALE):
         yield (
@@ -402,15 +402,15 @@ def print_summary(
     if gaps := sum(each.gaps for each in reports):
         print(f"gaps: {gaps} between rows that are not one period apart")
     zero = sensors.angle_zero and recorded_angle(sensors.angle_zero, config.layout)
-    for name, estimate, factor, unit in (
-        ("angle: true over recorded", sensors.angle_scale, 1, ""),
-        (f"upright where {config.layout.angle.name} is", zero, 1, ""),
-        ("position: true over recorded", sensors.position_scale, 1, ""),
-        ("state to effect of its motor value", sensors.delay, 1e3, " ms"),
+    for name, estimate, digits, factor, unit in (
+        ("angle: true over recorded", sensors.angle_scale, 4, 1, ""),
+        (f"upright where {config.layout.angle.name} is", zero, 7, 1, ""),
+        ("position: true over recorded", sensors.position_scale, 4, 1, ""),
+        ("state to effect of its motor value", sensors.delay, 4, 1e3, " ms"),
     ):
         if estimate is not None:
-            value, low, high = (factor * each for each in estimate)
-            print(f"{name}: {value:.4g}{unit} (95 %: {low:.4g} to {high:.4g})")
+            value, low, high = (f"{factor * each:.{digits}g}" for each in estimate)
+            print(f"{name}: {value}{unit} (95 %: {low} to {high})")
     if questioned and not (sensors.angle_scale or sensors.position_scale or sensors.delay):
         print("the recordings are too short, or show too little motion, to question their sensors")
     for doubt in found:

@@ -136,9 +136,9 @@ def learn(episodes: Sequence[Episode], dynamics: Dynamics, fit: Fit, config: Mod
         widening = float(ensemble.calibrate(longer).widening)
     if ensemble.allowed is not None and ensemble.allowed < SHARE:
         print(
-            f"warning: the members, moved apart {widening:g} times, allow {ensemble.allowed:.0%} of the "
-            f"errors, not {SHARE:.0%}: the model is less certain than its spreads say; record more, or give "
-            "more updates"
+            f"warning: the members, moved apart {widening:g} times, allow {ensemble.allowed:.1%} of some "
+            f"errors, not {SHARE:.0%}: the model is less certain than its spreads say; record more, or "
+            "give more updates"
         )
     return ensemble
 

@@ -72,8 +72,8 @@ WRONG_TRAINING = [
     ("buffer.alpha=100", "buffer.alpha=100: ", "give at most 2"),
     ("buffer.alpha=0", "buffer.alpha=0: with it, buffer.kind=prioritized draws uniformly", "buffer=uniform"),
     ("buffer=uniform buffer.kind=prioritized", "buffer.alpha=0: with it", "give buffer=prioritized, or"),
-    ("task.duration=1e20", "task.duration=1e+20: ", "give at most 3600 s"),
-    ("task.time_limit=100000000000000000000", "task.time_limit=1000", "give at most 1000000"),
+    ("task.duration=1e20", "task.duration=1e+20: ", "give at most 86400 s"),
+    ("task.time_limit=100000000000000000000", "task.time_limit=1000", "give at most 20000000"),
     ("task.angle_limit=-1", "task.angle_limit=-1: ", "give rad, above 0 and at most pi; or null"),
     ("task.angle_limit=12", "task.angle_limit=12: ", "at most pi; 12 degrees are 0.2094"),
     (

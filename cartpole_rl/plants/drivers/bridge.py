@@ -309,7 +309,7 @@ class Bridge:
         self._measured = 0  # of the control period
         self._stops_left = STOPS  # whatever the board did before
         self._homing_stops = 0  # that a homing of the board needs yet, if it is broken off
-        self._is_stopped = False  # for good
+        self._has_ended = False
 
     def listen(self) -> None:
         """Open and stop the board; learn how often it measures. Raises LinkError, PortError, ConfigError."""
@@ -658,7 +658,7 @@ class Bridge:
 
         A signal in its first instructions may end it at once: whoever runs the bridge ends it twice.
         """
-        if self._is_stopped:
+        if self._has_ended:
             return
         for number in (signal.SIGINT, *ending_signals()):
             signal.signal(number, signal.SIG_IGN)
@@ -679,7 +679,7 @@ class Bridge:
                 unstopped = error
         with suppress(Exception):
             self._driver.close()
-        self._is_stopped = True
+        self._has_ended = True
         if unstopped is not None and self._channel is not None:  # it was driven
             said = driver_error(self._settings, why if isinstance(why, Exception) else unstopped)
             raise LinkError(

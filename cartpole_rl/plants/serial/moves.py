@@ -36,10 +36,7 @@ from cartpole_rl.wire.messages import State, seconds_between
 NO_MOTION = (  # the remedy for a cart whose count does not change
     "switch the motor's supply on, check the cables of the motor and of the cart's encoder, free the cart"
 )
-BLIND = (  # what is said of a cart that should have moved
-    "the motor pushes, but the cart's count does not change",
-    f"{NO_MOTION}; if it moves freely, its file gives too little friction: cartpole-identify",
-)
+NO_SIGHT = "the motor pushes, but the cart's count does not change"
 
 REST_SECONDS = 0.3
 REST_COUNTS = 2  # of the cart
@@ -225,7 +222,8 @@ def centre(
         motor = controller.motor(before, state)
         before, state = state, moves.drive(motor)
         if blind.is_seen(motor, state.cart_counts, moves.period):
-            raise NotReadyError(*BLIND)
+            remedy = f"{NO_MOTION}; if it moves freely, its file gives too little friction: cartpole-identify"
+            raise NotReadyError(NO_SIGHT, remedy)
     raise NotReadyError(
         "the cart does not come back to the middle; it is "
         f"{moves.metres(state.cart_counts) * 1e3:+.0f} mm off",

@@ -17,9 +17,9 @@ from cartpole_rl.plants.measured import BlindMotion
 from cartpole_rl.plants.serial.cart import RESTARTED, SerialCart
 from cartpole_rl.plants.serial.errors import NotReadyError, check_limits, check_period, check_rig
 from cartpole_rl.plants.serial.moves import (
-    BLIND,
     LEFT,
     NO_MOTION,
+    NO_SIGHT,
     RIGHT,
     SURELY,
     ArmedCart,
@@ -154,7 +154,10 @@ class Probe(ArmedCart):
             if abs(after.cart_counts - before.cart_counts) >= moved:
                 return size, before, after
             if blind.is_seen(side * size, after.cart_counts, self.period):
-                raise NotReadyError(*BLIND)
+                rough = "or clean the track, and give more moving_friction in its file"
+                raise NotReadyError(
+                    f"at a motor value of {side * size:+d}, {NO_SIGHT}", f"{NO_MOTION}, {rough}"
+                )
         raise NotReadyError(f"motor values up to {side * largest:+d} do not move the cart's count", NO_MOTION)
 
     def centre(self) -> None:
@@ -291,8 +294,8 @@ def cart_direction(probe: Probe) -> str:
     if moved < 0:
         raise NotReadyError(
             f"motor value {value:+d} moves the cart's count down, by {-moved}",
-            "if the cart went right, swap its encoder's wires A and B, or change plant.cart_reversed; if it "
-            "went left, swap the motor's two, or change the sign of plant.full",
+            "if the cart went right, swap its encoder's wires A and B (plant=text: plant.cart_reversed); "
+            "if it went left, swap the motor's two (the sign of plant.full)",
         )
     probe.deadband[RIGHT] = value
     probe.centre()
@@ -331,7 +334,8 @@ def pole_direction(probe: Probe) -> str:
     if swung < 0:
         raise NotReadyError(
             f"a push to the right moves the hanging pole's count down, by {-swung}",
-            "swap the wires A and B of the pole's encoder, or turn its sign in the firmware",
+            "swap the wires A and B of the pole's encoder, or turn its sign in the firmware (plant=text: "
+            "plant.pole_reversed)",
         )
     return f"a push to the right swings the hanging pole to the left, {swung:+d} counts"
 

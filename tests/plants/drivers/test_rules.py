@@ -20,7 +20,7 @@ from cartpole_rl.plants.drivers.driver import Driver, Measurement
 from cartpole_rl.plants.settings import DriverSettings
 from cartpole_rl.rig.hardware import Encoders, hardware_of
 from cartpole_rl.rig.parameters import completed
-from cartpole_rl.signals import RaiseOnce, until_stopped
+from cartpole_rl.signals import until_stopped
 from cartpole_rl.wire.frames import encode_frame
 from cartpole_rl.wire.messages import Fault, Flags, Home, Message, Stop
 
@@ -436,15 +436,14 @@ def test_a_driver_that_raises_anything_leaves_a_stopped_board() -> None:
 
 
 def test_a_signal_while_the_end_begins_leaves_a_stopped_board(monkeypatch: pytest.MonkeyPatch) -> None:
-    bridge, signals = Playing(sends="value", full=255), iter([signal.SIGTERM])
+    bridge, raised = Playing(sends="value", full=255), iter([KeyboardInterrupt()])
 
-    def ignore_first(number: int, handler: Any) -> None:
-        for late in signals:
-            signal.raise_signal(late)
+    def ignore(number: int, handler: Any) -> None:
+        for error in raised:  # once, by the handler of a signal that came just before
+            raise error
 
     bridge.played.script = [LinkError("cable")]
-    RaiseOnce(lambda number: KeyboardInterrupt()).handle(signal.SIGTERM)
-    monkeypatch.setattr("cartpole_rl.plants.drivers.bridge.signal.signal", ignore_first)
+    monkeypatch.setattr("cartpole_rl.plants.drivers.bridge.signal.signal", ignore)
     with pytest.raises(KeyboardInterrupt), bridge:
         bridge.run_and_end()
     assert bridge.played.stops >= STOPS
