@@ -233,7 +233,13 @@ def recordings(source: Path) -> list[Path]:
     found = sorted((inner if inner.is_dir() else source).glob("*.csv"))
     if not found:
         missing = "it contains no recording" if source.exists() else "there is no such file or folder"
-        raise RecordingError(f"from={source}: {missing}; give a run of cartpole-record or cartpole-identify")
+        given = recorded_config(source).get("from")  # of an identification of others' recordings
+        remedy = (
+            f"it read those of from={given}"
+            if given
+            else "give a run of cartpole-record or cartpole-identify"
+        )
+        raise RecordingError(f"from={source}: {missing}; {remedy}")
     return found
 
 

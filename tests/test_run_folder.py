@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from cartpole_rl.errors import RecordingError
-from cartpole_rl.run_folder import experiments, is_outdated, recordings, write_inputs
+from cartpole_rl.run_folder import experiments, is_outdated, recordings, write_config, write_inputs
 
 
 def write(folder: Path, *names: str) -> list[Path]:
@@ -37,6 +37,14 @@ def test_no_recording_takes_the_name_of_another(tmp_path: Path) -> None:
 def test_a_source_without_recordings_is_refused(tmp_path: Path, name: str, missing: str) -> None:
     with pytest.raises(RecordingError, match=f"{missing}; give a run of cartpole-record"):
         recordings(tmp_path / name)
+
+
+def test_an_identification_of_others_recordings_names_them(tmp_path: Path) -> None:
+    write_config(tmp_path, "identify", {"from": "runs/import/a", "seed": 0})
+    with pytest.raises(
+        RecordingError, match=r"it contains no recording; it read those of from=runs/import/a$"
+    ):
+        recordings(tmp_path)
 
 
 @pytest.mark.parametrize("result", ["identification.json", "model.json", "checkpoints/last.pt"])
