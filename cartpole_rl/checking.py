@@ -13,8 +13,8 @@ from cartpole_rl.settings import Settings
 
 # the tags of unions, which pydantic adds to a key
 TAGS = re.compile(
-    r"(?<=^plant\.)(simulated|emulated|serial|text|driver|learned)\.|(?<=^learner\.)(local|ray)\."
-    r"|(?<=^randomization\.)(ranges|identified)\."
+    r"(?<=^plant)\.(simulated|emulated|serial|text|driver|learned)(?=\.|$)"
+    r"|(?<=^learner)\.(local|ray)(?=\.|$)|(?<=^randomization)\.(ranges|identified)(?=\.|$)"
     r"|\.literal\[[^]]*\]$|\.constrained-float$|(?<=\.wraps)\.bool$"
 )
 NEAR = 0.8  # similarity of two names, 0 to 1, from which one is suggested for the other

@@ -537,6 +537,8 @@ def _check_cart(word: str, cart: Chosen) -> None:
     # the numbers of a pole are refused with a line of their own
     (pole,) = group_choices("pole")["medium"]["choices"].values()
     known = [name for name in PARAMETERS if name not in pole]
+    if "choices" in cart.given:
+        raise ConfigError(f"{word}: it is the file of a pole; give it as {word.replace('cart=', 'pole=')}")
     for name in cart.given.keys() - PARAMETERS.keys() - {*HARDWARE}:
         nearest = most_similar(name, [*known, *HARDWARE])
         raise ConfigError(f"{word}: {name}: there is no such setting; did you mean {nearest}?")

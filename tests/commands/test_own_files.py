@@ -240,6 +240,14 @@ def test_a_file_of_a_group_that_a_command_does_not_read_is_refused(tmp_path: Pat
     assert done.complaint == "cartpole-finetune: cart: cartpole-finetune does not read this group"
 
 
+def test_the_file_of_a_pole_is_no_cart(tmp_path: Path) -> None:
+    (tmp_path / "my_pole.yaml").write_text(
+        "choices: {mine: {pole_mass: 0.1, pole_com: 0.2, pole_inertia: 1e-3}}\n"
+    )
+    told = "cart=my_pole.yaml: it is the file of a pole; give it as pole=my_pole.yaml"
+    assert refused(tmp_path, "cart=my_pole.yaml") == told
+
+
 def test_interpolation_in_a_file(tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text("defaults: [ip02]\ncart_mass: ${cart.cart_viscous}\n")
     config = load_settings(TrainConfig, {"cart": tmp_path / "mine.yaml"})
