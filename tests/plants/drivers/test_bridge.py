@@ -122,7 +122,8 @@ def test_a_board_that_homes_by_itself(tmp_path: Path) -> None:
     with driven_board(tmp_path / "journal", homing="board", home_line="home") as plant:
         assert plant.reset_one().counts == (0, 2048)
         lines = [line for _, line, _ in taken(tmp_path / "journal")]
-        assert lines[0] in ("home", "a=-0.000", "a=0.000")
+        assert lines[0] == ""  # which ends half a line of another host
+        assert lines[1] in ("home", "a=-0.000", "a=0.000")
         assert lines.count("home") == 1
 
 
