@@ -234,11 +234,8 @@ def recordings(source: Path) -> list[Path]:
     if not found:
         missing = "it contains no recording" if source.exists() else "there is no such file or folder"
         given = recorded_config(source).get("from")  # of an identification of others' recordings
-        remedy = (
-            f"it read those of from={given}"
-            if given
-            else "give a run of cartpole-record or cartpole-identify"
-        )
+        usual = "give a run of cartpole-record or cartpole-identify"
+        remedy = f"it read those of from={given}" if given else usual
         raise RecordingError(f"from={source}: {missing}; {remedy}")
     return found
 

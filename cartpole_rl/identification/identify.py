@@ -271,10 +271,10 @@ def warnings(fit: Fit, encoders: Encoders) -> list[str]:
         if left > UNINFORMED and abs(point) < 1 and np.isfinite(unknown.prior.unusual):
             found.append(f"the recordings hardly show {unknown.name}: its value is uncertain")
     texts = f"{1e3 * fit.spread[0]:.2g} mm", f"{np.degrees(fit.spread[1]):.2g} deg"
-    for name, rms, size, correlation, text in zip(
+    for name, spread, size, correlation, text in zip(
         ("cart", "pole"), fit.spread, encoders.resolution, fit.correlation, texts, strict=True
     ):
-        if rms > ROUNDING * size and correlation > CORRELATED:
+        if spread > ROUNDING * size and correlation > CORRELATED:
             found.append(
                 f"the residuals of the {name}'s position, {text}, are not white "
                 f"(neighbours correlate by {correlation:.2f}): the physics models lack something"

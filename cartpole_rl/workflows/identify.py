@@ -131,7 +131,7 @@ def identify_cart(config: IdentifyConfig, folder: Path, words: Sequence[str] | N
                 print("cartpole-identify", *words)
             else:  # the folder stays free for the next attempt
                 for name in (CONFIG, PROVENANCE):
-                    (folder / name).unlink()
+                    (folder / name).unlink(missing_ok=True)  # or its error would hide the first
             raise
     files = experiments(source)
     loaded = {name: read_recording(path) for name, path in files.items()}

@@ -110,10 +110,8 @@ def with_recorded_cart(
     """
     cart = recorded_config(run).get("cart")
     if cart is None:
-        return (
-            config,
-            "note: without the config.yaml of their run the recordings tell no cart: this is cart=ip02",
-        )
+        note = "without the config.yaml of their run the recordings tell no cart: this is cart=ip02"
+        return config, f"note: {note}"
     if cart == usual:
         return config, ""
     settings = {**config.model_dump(mode="json", by_alias=True), "cart": cart}

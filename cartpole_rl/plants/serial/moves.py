@@ -36,7 +36,7 @@ from cartpole_rl.wire.messages import State, seconds_between
 NO_MOTION = (  # the remedy for a cart whose count does not change
     "switch the motor's supply on, check the cables of the motor and of the cart's encoder, free the cart"
 )
-NO_SIGHT = "the motor pushes, but the cart's count does not change"
+UNSEEN_MOTION = "the motor pushes, but the cart's count does not change"
 
 REST_SECONDS = 0.3
 REST_COUNTS = 2  # of the cart
@@ -223,7 +223,7 @@ def centre(
         before, state = state, moves.drive(motor)
         if blind.is_seen(motor, state.cart_counts, moves.period):
             remedy = f"{NO_MOTION}; if it moves freely, its file gives too little friction: cartpole-identify"
-            raise NotReadyError(NO_SIGHT, remedy)
+            raise NotReadyError(UNSEEN_MOTION, remedy)
     raise NotReadyError(
         "the cart does not come back to the middle; it is "
         f"{moves.metres(state.cart_counts) * 1e3:+.0f} mm off",

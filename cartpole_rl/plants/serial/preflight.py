@@ -19,9 +19,9 @@ from cartpole_rl.plants.serial.errors import NotReadyError, check_limits, check_
 from cartpole_rl.plants.serial.moves import (
     LEFT,
     NO_MOTION,
-    NO_SIGHT,
     RIGHT,
     SURELY,
+    UNSEEN_MOTION,
     ArmedCart,
     centre,
     gentle_motor,
@@ -156,7 +156,7 @@ class Probe(ArmedCart):
             if blind.is_seen(side * size, after.cart_counts, self.period):
                 rough = "or clean the track, and give more moving_friction in its file"
                 raise NotReadyError(
-                    f"at a motor value of {side * size:+d}, {NO_SIGHT}", f"{NO_MOTION}, {rough}"
+                    f"at a motor value of {side * size:+d}, {UNSEEN_MOTION}", f"{NO_MOTION}, {rough}"
                 )
         raise NotReadyError(f"motor values up to {side * largest:+d} do not move the cart's count", NO_MOTION)
 
