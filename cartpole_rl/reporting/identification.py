@@ -72,7 +72,7 @@ def error_text(error: PredictionError) -> str:
     size = f"{1e3 * error.x:.2f} mm and {math.degrees(error.theta):.2f} deg"
     if not error.away:
         return f"{size}, the median of {error.stretches} seconds, none of them away from upright"
-    return f"{size}, the median of the {error.away} of {error.stretches} seconds away from upright"
+    return f"{size}, the median over the seconds away from upright ({error.away} of {error.stretches})"
 
 
 def identification_figures(
