@@ -163,6 +163,7 @@ def placed(values: Any) -> Expressions:
 
 
 SHAPES: dict[str, Callable[..., Any]] = {
+    "alias": lambda values: values,
     "cat": lambda parts, dim=0: np.concatenate(parts, dim),
     "clone": placed,
     "select": lambda values, dim, place: placed(np.take(values, place, dim)),

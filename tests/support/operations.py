@@ -39,4 +39,5 @@ OPERATIONS: tuple[Callable[[Tensor, Tensor], Tensor], ...] = (
     lambda a, b: (a.nan_to_num(0.0).clamp(-5000, 5000).long() + 2048) & 4095,
     lambda a, b: (a.nan_to_num(0.0).clamp(-5000, 5000).long() + 100) % 7,
     lambda a, b: (5 * (a > b).long() - 9 * (a < 1).long()) % 7,
+    lambda a, b: torch.ops.aten.alias(a),  # traced where another thread, as a profiler's, holds a frame
 )
