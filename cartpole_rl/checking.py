@@ -137,7 +137,7 @@ def _meant(detail: Mapping[str, Any]) -> str:
 
 
 def _plain(limit: Any) -> Any:
-    """Return a limit as one writes it: 1 for 1.0."""
+    """Return a limit as text: 1 for 1.0."""
     return int(limit) if isinstance(limit, float) and limit.is_integer() else limit
 
 
@@ -159,7 +159,7 @@ def kinds(schema: type[Settings], field: str) -> list[str]:
 
 
 def no_such_setting(key: str, known: Iterable[str]) -> str:
-    """Return the message for an unknown setting, with the most similar one, or with those of its group."""
+    """Return the message for an unknown setting, with the most similar name or all names of its group."""
     above, _, wrong = key.rpartition(".")
     known = sorted(known)
     if above == "parameters":
@@ -202,7 +202,7 @@ def nearest_choice(wrong: str, choices: Sequence[str]) -> str:
 
 
 def similarity(wrong: str, name: str) -> tuple[float, float]:
-    """Return the similarity of two names, 0 to 1, and that of their letters in any order, for equal ones."""
+    """Return the similarity of two names, 0 to 1, and, to break ties, of their letters in any order."""
     matcher = difflib.SequenceMatcher(None, name, wrong)
     return matcher.ratio(), matcher.quick_ratio()
 

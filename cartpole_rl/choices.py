@@ -1,4 +1,4 @@
-"""The choices in conf/ and a person's own, read one by one as plain data; `composition` composes them."""
+"""The choices in conf/ and a user's own, read one by one as plain data; `composition` composes them."""
 
 import json
 import re

@@ -125,7 +125,7 @@ VERBS: dict[str, Verb] = {
     "import": Verb(
         "identification.settings:ImportConfig",
         "workflows.import_logs:import_logs",
-        "makes recordings of anyone's logs, and says what is doubtful about them.\n"
+        "converts logs of any cart to recordings, and reports what is doubtful about them.\n"
         "A layout names the columns, their units and their signs.\n"
         "Recordings that cartpole-export wrote come back as they were.",
         "identification",
@@ -140,7 +140,7 @@ VERBS: dict[str, Verb] = {
         "workflows.config:ReplayConfig",
         "workflows.replay:replay_recordings",
         "compares the simulated cart with recordings.\n"
-        "Drives it with their motor values, and shows how far it deviates from them.",
+        "It drives the cart with the recorded motor values and shows the deviations.",
         "identification",
         (
             "from=runs/record/2026-11-21_12-00-00",
@@ -182,7 +182,7 @@ VERBS: dict[str, Verb] = {
     "distill": Verb(
         "workflows.config:DistillConfig",
         "workflows.distill:distill",
-        "trains a small network to drive as an agent does, for a small processor.",
+        "trains a small network to drive like an agent, for a small processor.",
         "exporting",
         (
             "run=runs/train/2026-11-21_12-00-00",

@@ -179,7 +179,7 @@ def wrong_option(words: Sequence[str]) -> str | None:
 
 
 def accept_all_characters() -> None:
-    """Let the output replace characters that its encoding lacks, as that of a pipe on Windows does."""
+    """Let the output replace characters that its encoding lacks, as on a pipe of Windows."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="replace")

@@ -219,7 +219,7 @@ class _OwnChoices:
         return f"{group}={','.join(self._name(group, each) for each in elements)}"
 
     def completed(self, words: list[str]) -> list[str]:
-        """Return the words, and those by which what the user gave outlasts other choices."""
+        """Return the words, and further ones that keep the user's values over other choices."""
         all_words = [*(self.params if MULTIRUN_FLAGS & {*words} else ()), *words]
         keys = {key_of(word) for word in all_words}
         frictions = [group for group in FRICTIONS if self.groups.get(group) is not None or group in keys]
@@ -259,7 +259,7 @@ class _OwnChoices:
         return [*words[:place], *more, *words[place:]]
 
     def _resumed(self, words: Sequence[str]) -> list[str]:
-        """Return what gives a resumed run's own choices of the groups of which single settings are given."""
+        """Return the words for a resumed run's own choices of groups of which single settings are given."""
         given = {key_of(word): word for word in words}
         groups = {key.partition(".")[0] for key in given if "." in key}.intersection(RESUMED) - given.keys()
         runs = _elements(given["resume"], "") if groups and "resume" in given else None
@@ -391,7 +391,7 @@ def task_overrides(given: list[str] | ListConfig) -> list[str]:
 
 
 def is_completing(word: str) -> bool:
-    """Return True for an override that no user gave: one that completes others."""
+    """Return True for an override that completes others, which no user gave."""
     in_periods = (f"++{name}=null" for name in IN_PERIODS.values())
     return word.startswith((f"+{OWN}/", KEPT)) or bool(
         word in in_periods or re.fullmatch(r"\+\+\w+_friction\.parameters\.\w+=null", word)

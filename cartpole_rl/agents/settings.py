@@ -99,7 +99,7 @@ class AgentSettings(Settings):
         return self.model_copy(update={"gamma": gamma, "action_gap": gap})
 
     def check(self, control_period: float) -> None:
-        """Raise ConfigError for a new training whose discount or action gap would be all but 1."""
+        """Raise ConfigError for a new training with a discount or an action gap of nearly 1."""
         for given, name, time, longest, number in (
             (self.gamma, "horizon", self.horizon, LONGEST_HORIZON, "discount"),
             (self.action_gap, "action_time", self.action_time, LONGEST_ACTION, "action gap"),

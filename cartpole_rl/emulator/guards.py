@@ -326,7 +326,7 @@ class TrackLimits:
 
     @property
     def _stands(self) -> bool:
-        """Whether the count is as before. An open wire lets that of a moving cart change by one."""
+        """True if the count is as before, within one: with an open wire a moving cart's changes by one."""
         return self._count is not None and abs(self._newest - self._count) <= 1
 
     def _cart_speed(self) -> int:

@@ -65,7 +65,7 @@ SUBSTEPS = 4
 
 
 class Centre(NamedTuple):
-    """Where the centre of mass of cart and pole is and how it moves, positive to the right; [N] or floats."""
+    """Position and velocity of the centre of mass of cart and pole, positive to the right; [N] or floats."""
 
     mass: Tensor | float  # of cart and pole, over the cart's: 1 + mu
     reach: Tensor | float  # m, its largest distance from the cart: r
@@ -131,7 +131,7 @@ def guard_direction(
 
 
 def own_direction(motion: Measured, track_end: Tensor, guard: TrackGuard, length: Tensor | None) -> Tensor:
-    """Return the direction without that of a second guard."""
+    """Return the direction of this guard alone, without the second one."""
     x, x_dot = motion.x, motion.x_dot
     if guard.pole is None:
         return guard_side(x, x_dot, track_end, guard)

@@ -147,7 +147,7 @@ def checked_actions(actions: Any, space: spaces.Space[Any], number: int) -> Arra
 
 
 class Carts:
-    """What the environments of one cart and of many share: the simulated carts `env` and their pictures."""
+    """Base of the environments of one cart and of many: the simulated carts `env` and their pictures."""
 
     env: CartPoleEnv
     renderer: Renderer | None = None
@@ -192,7 +192,7 @@ class Carts:
 
 
 class CartPoleGymnasium(Carts, gymnasium.Env[Array, np.int64], EzPickle):
-    """One simulated cart. It has no time limit; `gymnasium.make` adds that of the registration.
+    """One simulated cart. It has no time limit; `gymnasium.make` adds the registered one.
 
     `choices` are the settings named above, as keyword arguments. Raises ConfigError.
     """

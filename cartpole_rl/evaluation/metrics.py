@@ -82,7 +82,7 @@ def _recovery(episode: Episode) -> dict[str, Any]:
 
 
 def same_as_host(episode: Episode) -> tuple[int, int]:
-    """Return how many motor values of the board are those of this computer, and how many were compared."""
+    """Return how many motor values of board and computer agree, and how many were compared."""
     assert episode.expected is not None
     assert episode.compared is not None
     same = (episode.motor == episode.expected) & episode.compared
@@ -100,7 +100,7 @@ def _same_as_host(episode: Episode) -> dict[str, Any]:
 
 
 def _reversals_per_s(episode: Episode) -> float | None:
-    """Return how often a motor value has another sign than the last one that was not 0."""
+    """Return how often the sign of the motor value changes, zeros left out."""
     directions = np.sign(episode.motor[episode.motor != 0])
     seconds = float(episode.time[-1] - episode.time[0])
     return float(np.count_nonzero(np.diff(directions))) / seconds if seconds > 0 else None

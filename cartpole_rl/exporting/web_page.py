@@ -55,7 +55,7 @@ class Counts(NamedTuple):
 
 
 class Push(NamedTuple):
-    """What the reader does to the cart in a period."""
+    """A push by the reader in a period."""
 
     force: Tensor  # [1, 1] N on the cart
     angular_acceleration: Tensor  # [1, 1] rad/s^2 of the pole

@@ -141,9 +141,9 @@ class Samples:
 
     @cached_property
     def _explained(self) -> tuple[float, float, float]:
-        """What the equation leaves unexplained at the best scale, the scale, and its gravity.
+        """Return the unexplained part of the equation at the best scale, the scale, and its gravity.
 
-        The scale is the one that was told, unless another one explains far more.
+        The scale is the given one, unless another one explains far more.
         """
         told, *others = map(self._fit, SCALES)
         best = min(others)
@@ -178,7 +178,7 @@ class Samples:
 
     @property
     def response(self) -> float:
-        """How much a motor value accelerates its cart at once, apart from all else: 1 always, -1 never.
+        """Correlation of motor value and immediate acceleration of the cart, all else removed, -1 to 1.
 
         Only short delays count. The speed is among all else, so an older value is left with the other sign.
         """
@@ -190,7 +190,7 @@ class Samples:
 
     @property
     def lag(self) -> float:
-        """How much a cart that accelerates leaves its pole behind: 1 always, -1 never."""
+        """Correlation of the cart's acceleration with the pole's lag behind it, -1 to 1."""
         if len(self.piece) < LEAST_OF_A_SIGN:
             return 0.0
         terms = self.pole_terms(self.unit)

@@ -50,7 +50,7 @@ class CartParameters:
 
     @property
     def driven_mass(self) -> Tensor:
-        """What the motor accelerates, kg, [N]: a motor that cannot be driven back does not feel the pole."""
+        """The accelerated mass, kg, [N]: a motor that cannot be driven back does not feel the pole."""
         return self.cart_mass + self.backdrivability * self.pole_mass
 
     @property

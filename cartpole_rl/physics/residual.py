@@ -71,7 +71,7 @@ class Residual(NamedTuple):
 
     @property
     def weights(self) -> tuple[Tensor, ...]:
-        """What is learned: the tables and the networks."""
+        """The learned tensors: tables and networks."""
         return self[:-3]
 
     def with_weights(self, weights: Sequence[Tensor]) -> Self:

@@ -1,4 +1,4 @@
-"""N carts that move like a recorded one: identified physics, and one member of an ensemble for each episode.
+"""N carts that move like a recorded cart: identified physics, and an ensemble's member per episode.
 
 The members differ where the recordings give no information, so that an agent is trained on this uncertainty
 as well. Carts are drawn as in any simulated plant; the learned residual is added to all of them.

@@ -40,7 +40,7 @@ def changed_words(group: str, settings: Settings, defaults: Mapping[str, Any]) -
 
 
 class PlantSettings(Settings):
-    """The settings of a plant. Its answers here are those of carts that this process simulates."""
+    """The settings of a plant. The methods here answer for carts that this process simulates."""
 
     kind: str
     place: ClassVar[str]  # "module:name" of the function that `build` calls
@@ -88,7 +88,7 @@ class PlantSettings(Settings):
         return None
 
     def own_pole(self, emulator: EmulatorSettings, trained: PoleSettings) -> PoleSettings | None:
-        """Return the pole on the cart, where the agent was trained with `trained`; None for that of pole=."""
+        """Return the pole on the cart for an agent trained with `trained`; None for the pole of pole=."""
         return None
 
     def build(self, *arguments: Any, **named: Any) -> Any:
@@ -310,7 +310,7 @@ class BoardSettings(RealCartSettings):
 
     @property
     def lacks(self) -> list[str]:
-        """What protects our carts and not this one, a line each."""
+        """The protections that this cart lacks, a line each."""
         every = "this computer stands in for the limits, the brake and the watchdog, once a measurement"
         alone = "if this computer or the cable fails, nothing stops a moving cart: keep a switch at hand"
         homes = "if the cart does not move now, its board has not homed: press Ctrl-C"
@@ -404,7 +404,7 @@ class TextSettings(BoardSettings):
 
     @property
     def lacks(self) -> list[str]:
-        """What protects our carts and not this one, a line each."""
+        """The protections that this cart lacks, a line each."""
         lines = "a damaged line that still reads as numbers is only noticed if they jump"
         clock = (
             "without a column time, old lines are taken for new ones, and a restart is seen only by a jump"

@@ -215,7 +215,7 @@ class SimulatedPlant(Plant):
         self._coming = self._draw_starts(0)
 
     def snapshot(self) -> dict[str, Any]:
-        """Return everything on which the next step depends, for `restore`."""
+        """Return the whole state of the plant, for `restore`."""
         coming = {f"next_{name}": value.clone() for name, value in self._coming._asdict().items()}
         now = {name: value.clone() for name, value in self._carts._asdict().items()}
         return {**now, **coming, "generator": self._generator.get_state()}

@@ -76,7 +76,7 @@ class Member:
 
     @property
     def agent_key(self) -> tuple[Any, ...]:
-        """What tells its agent from others of its group: the seeds, and the source if its run is lost."""
+        """The key of its agent in its group: the seeds, and the source if its run is lost."""
         return self.seeds if self.agent or not self.run.agent else (*self.seeds, self.source)
 
     @property

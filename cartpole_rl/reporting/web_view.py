@@ -125,7 +125,7 @@ def page(title: str, pole_length: float, replays: bool, grows: bool = False) -> 
 
 
 class Stop:
-    """What interrupts the process that started this one, which then sets the motor to 0 and reports.
+    """Interrupts the parent process, which then sets the motor to 0 and reports.
 
     `answer` is what the page says then.
     """

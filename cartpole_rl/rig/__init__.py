@@ -1,1 +1,1 @@
-"""What a cart is: its parameters and its hardware."""
+"""The parameters and the hardware of a cart."""

@@ -1,4 +1,4 @@
-"""Make recordings of anyone's logs, or of exported recordings, and say what is doubtful about the logs.
+"""Convert logs of any cart, or exported recordings, to recordings, and report what is doubtful in logs.
 
 Motion tells much of what a layout can get wrong: signs, the scale and the zero of the angle, the scale of the
 position, and a motor value that was chosen a row earlier or later.

@@ -218,7 +218,7 @@ class StandIn(Firmware):
 
 
 class MotorCommands:
-    """What is sent for a motor value, in the unit that the board takes: `settings.sends`.
+    """The command for a motor value, in the unit that the board takes: `settings.sends`.
 
     A board that takes accelerations lets the cart roll at 0. Its speed is then needed also while nothing is
     measured: it follows from what was sent.
@@ -725,7 +725,7 @@ def longest_gap(arrived: int) -> int:
 
 
 def driver_error(settings: BoardSettings, error: Exception) -> CartPoleError:
-    """Return the error for one that a driver raised: itself, if it says in one line what is wrong."""
+    """Return a driver's error as one line that says what is wrong; the error itself if it is one."""
     if isinstance(error, CartPoleError):
         return error
     return LinkError(f"plant.driver={settings.driver} failed: {type(error).__name__}: {reason_of(error)}")

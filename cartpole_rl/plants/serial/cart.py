@@ -326,7 +326,7 @@ class SerialCart:
 
     @property
     def longest_suspension(self) -> float:
-        """The time in s without an answer of this computer after which the link counts as lost."""
+        """The time in s after which, without an answer of this computer, the link counts as lost."""
         return min(self.settings.timeout, LONGEST_SUSPENSION)
 
     @contextmanager

@@ -1,4 +1,4 @@
-"""What is wrong with a cart, in words and each with its remedy: its refusals, its faults, its INFO.
+"""Error messages with remedies for a cart: its refusals, its faults, its INFO.
 
 Positions, angles and forces are computed from the numbers of the cart's file: metres per count, counts per
 turn, the span of the track. A cart that reports others is refused: every number would be wrong. So is one

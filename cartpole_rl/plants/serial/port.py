@@ -1,4 +1,4 @@
-"""The serial ports of this computer: those that may be a cart, and opening one; why one cannot be opened.
+"""The serial ports of this computer: find those that may be a cart, open one, explain why it fails.
 
 A board is recognized by the vendor id of the chip between its USB plug and its serial line (the USB ID
 Repository, linux-usb.org/usb.ids). An ESP32 board restarts when DTR or RTS rise, so both are set low before
@@ -58,7 +58,7 @@ class UsbPort:
 
     @property
     def identity(self) -> tuple[int, int, str]:
-        """What tells this device from another: without a serial number of its own, where it is plugged in."""
+        """The identity of this device: its serial number, or else the socket that it is plugged into."""
         own = self.serial_number if self.serial_number not in NOT_ITS_OWN else f"at {self.location}"
         return self.vendor, self.product, own
 

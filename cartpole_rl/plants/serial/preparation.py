@@ -32,7 +32,7 @@ Confirm = Callable[[str], bool]  # shows a person the text; True if the person s
 
 @dataclass(frozen=True)
 class PolePosition:
-    """A position of the pole in which an episode starts. Angles in rad, 0 upright."""
+    """A position of the pole at the start of an episode. Angles in rad, 0 upright."""
 
     angle: float
     tolerance: float
