@@ -140,3 +140,16 @@ def test_the_target_exists_and_the_folder_is_that_of_runs(page: str, command: st
         assert words[1:] == ["--logdir", "runs"], f"{page}: {command}"
     elif "-C" not in words:
         assert subprocess.run([*words, "--dry-run"], cwd=ROOT, capture_output=True).returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("page", "folder", "pattern"),
+    [
+        ("scripts/README.md", "scripts/bench", "{}.py"),
+        ("docs/randomization.md", "conf/randomization", "`{}`"),
+    ],
+)
+def test_a_page_names_each_file_of_a_folder(page: str, folder: str, pattern: str) -> None:
+    text = (ROOT / page).read_text()
+    names = [path.stem for path in (ROOT / folder).iterdir() if path.suffix in (".py", ".yaml")]
+    assert [name for name in names if pattern.format(name) not in text] == []
