@@ -77,8 +77,7 @@ from cartpole_rl.workflows.config import EvaluateConfig, FinetuneConfig, TrainCo
 from cartpole_rl.workflows.finetuning_cart import FinetuningCart, FinetuningFiles, Stage, yielding_to
 from cartpole_rl.workflows.finetuning_learner import CartLearner, TunedAgent, check_simulation, check_warmup
 from cartpole_rl.workflows.poles import other_pole, plant_words
-from cartpole_rl.workflows.ray_learner import LearnerTask, Offer
-from cartpole_rl.workflows.ray_link import LearnerLink
+from cartpole_rl.workflows.ray_learner import LearnerLink, LearnerTask, Offer
 
 NAME = "learner"  # in a checkpoint: the name of a learner of Ray
 POLL = 0.1  # s between two looks for weights

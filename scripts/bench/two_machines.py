@@ -33,7 +33,7 @@ from network import Cable, Machine, two_machines
 from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
 
 from cartpole_rl.learning.checkpoints import load_agent
-from cartpole_rl.workflows.ray_link import SETTINGS
+from cartpole_rl.workflows.ray_learner import SETTINGS
 
 PORT = 6479
 DELAY = 0.05  # s, each way

@@ -14,7 +14,7 @@ from command_line import FINETUNING, Outcome, in_process, interrupt_after
 
 from cartpole_rl.learning.checkpoints import FINETUNING_FORMAT, load_training
 from cartpole_rl.workflows.finetune import NAME
-from cartpole_rl.workflows.ray_link import SETTINGS
+from cartpole_rl.workflows.ray_learner import SETTINGS
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +82,7 @@ from pathlib import Path
 import ray
 from cartpole_rl.evaluation.recordings import read_recording
 from cartpole_rl.workflows.ray_learner import Taken
-from cartpole_rl.workflows.ray_link import joined
+from cartpole_rl.workflows.ray_learner import joined
 
 address, name, recording = sys.argv[1:]
 with joined(address):

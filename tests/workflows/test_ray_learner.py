@@ -26,16 +26,19 @@ from cartpole_rl.errors import ConfigError, LearnerError, LearningError
 from cartpole_rl.evaluation.driving_policy import Weights, as_weights
 from cartpole_rl.learning.checkpoints import FINETUNING_FORMAT, AgentCheckpoint, load_training
 from cartpole_rl.learning.settings import RayLearnerSettings
-from cartpole_rl.workflows import ray_link
+from cartpole_rl.workflows import ray_learner
 from cartpole_rl.workflows.build import new_agent
 from cartpole_rl.workflows.config import FinetuneConfig, TrainConfig, load_settings
 from cartpole_rl.workflows.finetune import NAME, learn_there, take
 from cartpole_rl.workflows.finetuning_cart import FinetuningFiles, Stage
 from cartpole_rl.workflows.finetuning_learner import TunedAgent
-from cartpole_rl.workflows.ray_learner import Curves, Learner, Offer, Taken
-from cartpole_rl.workflows.ray_link import (
+from cartpole_rl.workflows.ray_learner import (
+    Curves,
+    Learner,
     LearnerLink,
     Link,
+    Offer,
+    Taken,
     check_address,
     check_versions,
     version_finder,
@@ -297,7 +300,7 @@ def test_the_reason_of_a_process_that_ends_is_shown_and_it_is_started_again(
     assert link.is_lost
     assert shown[2:] == [f"the learner is lost: {reason}"]
     assert len(link.ends) == 1
-    monkeypatch.setattr(ray_link, "PAUSE", 0.0)
+    monkeypatch.setattr(ray_learner, "PAUSE", 0.0)
     link.poll()
     link.poll()
     assert len(link.ends) == 2
@@ -316,7 +319,7 @@ def test_a_learner_that_cannot_be_used_is_refused_at_the_start(
     with pytest.raises(LearnerError, match="other versions"):
         new_link(shown).connect()
     monkeypatch.setattr(PipedLink, "first", ConnectionError("Connection refused"))
-    monkeypatch.setattr(ray_link, "FIRST_CONNECTION", 0.5)
+    monkeypatch.setattr(ray_learner, "FIRST_CONNECTION", 0.5)
     link = new_link(shown)
     link.ends[0].close()
     with pytest.raises(LearnerError) as raised:
@@ -371,7 +374,7 @@ def test_a_learner_with_an_episode_that_was_moved_away_is_replaced(
 ) -> None:
     """By one that gets the episode that is driven again; until it answers, the cart is not driven."""
     monkeypatch.setattr(Learner, "_tune", lambda learner: None)
-    monkeypatch.setattr(ray_link, "PERIOD", 0.0)
+    monkeypatch.setattr(ray_learner, "PERIOD", 0.0)
     monkeypatch.setitem(sys.modules, "ray", ray := Ray(ending=2))
     learners = [Learner(SimpleNamespace()) for _ in range(2)]
     for version, learner in enumerate(learners):
