@@ -23,8 +23,7 @@ from cartpole_rl.exits import Terminated
 from cartpole_rl.reporting.loggers import LOGGERS, Loggers
 from cartpole_rl.reporting.tensorboard import scalars
 from cartpole_rl.workflows.config import TrainConfig, load_settings
-from cartpole_rl.workflows.monitor import TrainingMonitor
-from cartpole_rl.workflows.train import train
+from cartpole_rl.workflows.train import TrainingMonitor, train
 
 SHORT = {**TOY[TrainConfig], "task.time_limit": 50, "learning.evaluations": 2}
 INSTALLED = [name for name in ("mlflow", "wandb") if find_spec(name)]

@@ -120,7 +120,7 @@ def same_handlers() -> Iterator[None]:
 def no_pictures() -> Iterator[None]:
     """Draw no figures and no animations, which take most of the time of a tiny run."""
     episodes = "cartpole_rl.reporting.episodes"
-    monitor = "cartpole_rl.workflows.monitor.TrainingMonitor"
+    monitor = "cartpole_rl.workflows.train.TrainingMonitor"
     with contextlib.ExitStack() as stack:
         for name in (f"{episodes}.draw", f"{monitor}._log_pictures"):
             stack.enter_context(patch(name, lambda *arguments: None))
