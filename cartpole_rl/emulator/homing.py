@@ -257,12 +257,15 @@ class Homing:
         if abs(span - nominal) > nominal * 3 // 100:
             track = f"{self._hardware.track_span:g} m"
             raise HomingError(f"the ends are {span / 1e9:.3f} m apart, not {track}")
-        middle = (left + right) // 2
+        return Zeros(left, right, (yield from self.settle((left + right) // 2, reading)))
+
+    def settle(self, middle: int, reading: Reading) -> Generator[int, Reading, int]:
+        """Let the cart stand in the middle, its pole hanging still; return the pole's count then."""
         reading = yield from self.centre(middle, reading)
         hanging, reading = yield from self.find_hanging(reading)
         reading = yield from self.brake_swing(middle, hanging, reading)
         reading = yield from self.centre(middle, reading)
-        return Zeros(left, right, (yield from self.wait_until_still(reading)))
+        return (yield from self.wait_until_still(reading))
 
     def _touch_ends(self, reading: Reading) -> Procedure:
         """Find the ends that have a switch, or without any both stops."""

@@ -192,11 +192,7 @@ class StandIn(Firmware):
         finally:
             self.board_homes = False
         middle = reading.cart - self._hardware.encoders.cart_counts(self._settings.home_position)
-        reading = yield from homing.centre(middle, reading)
-        hanging, reading = yield from homing.find_hanging(reading)
-        reading = yield from homing.brake_swing(middle, hanging, reading)
-        reading = yield from homing.centre(middle, reading)
-        return self._zeros_about(middle, (yield from homing.wait_until_still(reading)))
+        return self._zeros_about(middle, (yield from homing.settle(middle, reading)))
 
     def _until_board_rests(self, reading: Reading) -> Generator[int, Reading, Reading]:
         window, elapsed, first, moved = Window(BOARD_RESTS_US), 0, reading.cart, False
