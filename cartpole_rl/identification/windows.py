@@ -184,7 +184,7 @@ def mean_gap(time: NDArray[np.float64]) -> float:
     return float(f"{near.mean() if near.size else median:.4g}")
 
 
-def split(episodes: Sequence[Episode]) -> tuple[list[Episode], list[Episode]]:
+def hold_out(episodes: Sequence[Episode]) -> tuple[list[Episode], list[Episode]]:
     """Return episodes to learn from and held-out ones: every fifth, or the last fifth of each of a few."""
     if len(episodes) >= HELD_OUT_OF:
         chosen = range(HELD_OUT_OF // 2, len(episodes), HELD_OUT_OF)

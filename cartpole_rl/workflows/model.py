@@ -25,7 +25,7 @@ from cartpole_rl.identification.fit import Fit, best_fit
 from cartpole_rl.identification.identify import HORIZON
 from cartpole_rl.identification.prediction import CERTAIN, LEAD, REPORTED, errors_at, predict
 from cartpole_rl.identification.rollout import Dynamics
-from cartpole_rl.identification.windows import Windows, cut_windows, held_out_windows, lead_periods, split
+from cartpole_rl.identification.windows import Windows, cut_windows, held_out_windows, hold_out, lead_periods
 from cartpole_rl.physics.friction import CART_FRICTIONS
 from cartpole_rl.physics.models import Models
 from cartpole_rl.plants.learned import LearnedModel, save_model
@@ -72,7 +72,7 @@ def learn_model(config: ModelConfig, folder: Path) -> None:
     period = shared_period(by_file)
     check_each(by_file, period)
     check_directions(episodes, period)
-    training, held_out = split(episodes)
+    training, held_out = hold_out(episodes)
     windows = held_out_windows(held_out, period, max(REPORTED_TIMES))
     with waiting("fitting the physics"):
         fit, models = fit_physics(cut_windows(training, period), config, pole, period)

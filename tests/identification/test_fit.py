@@ -21,7 +21,7 @@ from cartpole_rl.identification.windows import (
     cut_windows,
     held_out_windows,
     history_periods,
-    split,
+    hold_out,
 )
 from cartpole_rl.physics.friction import CART_FRICTIONS, COULOMB, coulomb_force
 from cartpole_rl.physics.models import Models
@@ -231,10 +231,10 @@ def test_too_short_is_named() -> None:
 
 def test_every_fifth_is_held_out_or_the_last_fifth_of_a_few() -> None:
     whole = [numbered(100 + number, 0.02) for number in range(10)]
-    learned, held_out = split(whole)
+    learned, held_out = hold_out(whole)
     assert [each.steps for each in held_out] == [102, 107]
     assert len(learned) == 8
-    learned, held_out = split(whole[:1])
+    learned, held_out = hold_out(whole[:1])
     assert (learned[0].steps, held_out[0].steps) == (80, 20)
     assert held_out[0].motor[0] == learned[0].motor[-1] + 1
 
