@@ -17,6 +17,7 @@ import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from cartpole_rl.drawing import filled
 from cartpole_rl.drawing.colours import (
     BLACK,
     BLUE,
@@ -190,35 +191,10 @@ def _variables(colours: Mapping[str, str]) -> str:
     return " ".join(f"--{name}: {colour};" for name, colour in colours.items())
 
 
-PAGE_STYLE = f"""
-:root {{ color-scheme: light dark; {_variables(LIGHT)} }}
-@media (prefers-color-scheme: dark) {{ @media screen {{ :root {{ {_variables(DARK)} }} }} }}
-body {{ font: 16px/1.5 system-ui, sans-serif; color: var(--ink); background: var(--paper); max-width: 60rem;
-       margin: 2rem auto; padding: 0 1rem; overflow-wrap: break-word; }}
-h1 {{ font-size: 1.7rem; line-height: 1.25; }} h2 {{ font-size: 1.15rem; margin-top: 2.2rem; }}
-a {{ color: var(--link); }}
-table {{ border-collapse: collapse; }} th, td {{ text-align: left; padding: .25rem 1.2rem .25rem 0; }}
-th {{ color: var(--muted); font-weight: normal; border-bottom: 1px solid var(--muted); }}
-td {{ border-bottom: 1px solid var(--faint); vertical-align: top; }}
-.number {{ white-space: nowrap; }}
-img {{ max-width: 100%; background: {PAPER}; border-radius: 4px; }}
-code {{ background: var(--faint); padding: .1rem .3rem; overflow-wrap: anywhere; }}
-@media (max-width: 40rem) {{
-  body {{ margin: 1rem auto; }}
-  table {{ display: block; overflow-x: auto; }} th, td {{ padding-right: .8rem; }}
-  .cards, .cards tbody, .cards tr, .cards td {{ display: block; }}
-  .cards tr {{ border-bottom: 1px solid var(--muted); padding: .4rem 0; }}
-  .cards tr:has(th) {{ display: none; }}
-  .cards td {{ border: 0; padding: .1rem 0; }}
-  .cards td::before {{ content: attr(data-label) ": "; color: var(--muted); }}
-}}
-@media print {{
-  :root {{ color-scheme: light; }}
-  body {{ font-size: 10pt; max-width: none; margin: 0; }}
-  a {{ color: inherit; text-decoration: none; }}
-  figure, svg, tr, pre {{ break-inside: avoid; }} h2, h3 {{ break-after: avoid; }}
-}}
-"""
+PAGE_STYLE = filled(
+    Path(__file__).with_name("style.css"),
+    {"light": _variables(LIGHT), "dark": _variables(DARK), "paper": PAPER},
+)
 NUMBER = re.compile(r"-?\d[\w.,%±() –-]{0,28}$")  # "4104 (4062 to 4177)", "10 of 10"
 
 
@@ -236,7 +212,7 @@ def document(title: str, body: str, extra_style: str = "") -> str:
     return (
         f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title>'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<style>{PAGE_STYLE}{extra_style}</style></head>\n<body>\n{body}\n</body></html>\n"
+        f"<style>\n{PAGE_STYLE}{extra_style}</style></head>\n<body>\n{body}\n</body></html>\n"
     )
 
 
