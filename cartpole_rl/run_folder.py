@@ -5,13 +5,12 @@ A command refuses the run folder of a command whose results it cannot use.
 
 import hashlib
 import json
-import os
 import platform
 import re
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from importlib.metadata import distributions
 from pathlib import Path
 from typing import Any
@@ -41,7 +40,6 @@ PRETRAINED, PRETRAINED_AGENT = "pretrained", "agent.pt"  # run=pretrained/medium
 CART, POLE, RANDOMIZATION, POSTERIOR = "cart.yaml", "pole.yaml", "randomization.yaml", "posterior.npz"
 RUN_FILES = (CONFIG, CART, POLE, RANDOMIZATION)
 INPUTS = "inputs.json"  # hashes of files, which are named as seen from the run folder
-FOUND = (Path(CHECKPOINTS, LAST), Path(IDENTIFIED), Path(MODELLED))
 
 PREFIX = "cartpole-"
 AGENT_HASH = "agent_sha256"  # in provenance.json: of the checkpoint that a run started from
@@ -248,13 +246,6 @@ def experiments(source: Path) -> dict[str, Path]:
     names = {path: re.sub(r"^\d\d_(?=.)", "", path.stem) for path in recordings(source)}
     taken = Counter([*names.values(), *(path.stem for path, name in names.items() if path.stem != name)])
     return {name if taken[name] == 1 else path.stem: path for path, name in names.items()}
-
-
-def write_inputs(folder: Path, needs: Iterable[Path]) -> None:
-    """Write the hashes of what the runs `needs` have found into the run folder."""
-    files = [need / name for need in needs for name in FOUND if (need / name).is_file()]
-    hashes = {Path(os.path.relpath(file, folder)).as_posix(): file_hash(file) for file in files}
-    write_json(folder / INPUTS, hashes)
 
 
 def is_outdated(folder: Path) -> bool:

@@ -3,9 +3,10 @@
 from pathlib import Path
 
 import pytest
+from worker import write_inputs
 
 from cartpole_rl.errors import RecordingError
-from cartpole_rl.run_folder import experiments, is_outdated, recordings, write_config, write_inputs
+from cartpole_rl.run_folder import experiments, is_outdated, recordings, write_config
 
 
 def write(folder: Path, *names: str) -> list[Path]:

@@ -8,9 +8,11 @@ import signal
 import sys
 import threading
 import traceback
+from collections.abc import Iterable
 from contextlib import nullcontext, suppress
 from importlib import import_module
 from multiprocessing.connection import Connection
+from pathlib import Path
 
 from plan import Task
 
@@ -22,14 +24,17 @@ from cartpole_rl.run_folder import (
     CHECKPOINTS,
     COMPARISON,
     IDENTIFIED,
+    INPUTS,
+    LAST,
     LOG,
     METRICS,
     MODELLED,
     PREFIX,
     RESUME,
+    file_hash,
     is_outdated,
     recorded_provenance,
-    write_inputs,
+    write_json,
 )
 from cartpole_rl.signals import RaiseOnce, ending_signals
 
@@ -43,6 +48,7 @@ COMMANDS = {  # command: the module and the function that carry it out, and its 
 MODULES = [module for module, *_ in COMMANDS.values()]
 RESUMABLE = ("train", "finetune")
 RESULTS = {"identify": IDENTIFIED, "model": MODELLED, "finetune": COMPARISON}  # of the other commands METRICS
+FOUND = (Path(CHECKPOINTS, LAST), Path(IDENTIFIED), Path(MODELLED))  # what other runs need
 LONGEST = 1000  # characters of a reason: a pipe holds it until it is read
 SIGNALLED = 128  # added to the number of a signal, as a shell does
 
@@ -121,6 +127,13 @@ def finish(task: Task) -> None:
                 else:
                     traceback.print_exception(error)
             raise
+
+
+def write_inputs(folder: Path, needs: Iterable[Path]) -> None:
+    """Write the hashes of what the runs `needs` have found into the run folder."""
+    files = [need / name for need in needs for name in FOUND if (need / name).is_file()]
+    hashes = {Path(os.path.relpath(file, folder)).as_posix(): file_hash(file) for file in files}
+    write_json(folder / INPUTS, hashes)
 
 
 def prepare(task: Task) -> bool:
