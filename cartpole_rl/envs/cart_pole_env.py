@@ -14,11 +14,11 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import Compose, EnvBase, FrameSkipTransform, TransformedEnv
 
+from cartpole_rl.arithmetic.writer import Scalar, plain
 from cartpole_rl.envs.hardware import HardwareTransform, finite_actions
 from cartpole_rl.envs.perception import Percept, Previous
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.plants.specs import Numbers, Plant, PlantOutput, tensordict_of
-from cartpole_rl.scalar import Scalar, plain
 from cartpole_rl.tasks.settings import NO_ACTION
 
 

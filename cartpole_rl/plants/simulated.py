@@ -16,6 +16,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from cartpole_rl.arithmetic.writer import Scalar, plain
 from cartpole_rl.compilation import Compiled
 from cartpole_rl.physics.dynamics import Drive, MakeAddition, State, run_period
 from cartpole_rl.physics.models import Models, check_laws
@@ -25,7 +26,6 @@ from cartpole_rl.plants.specs import Numbers, Plant, PlantOutput
 from cartpole_rl.randomization.randomizer import START_SHARE, Draws, draw_start, within_track
 from cartpole_rl.rig.hardware import Encoders, Hardware
 from cartpole_rl.rig.parameters import PARAMETERS
-from cartpole_rl.scalar import Scalar, plain
 from cartpole_rl.tasks.episode import Origin
 from cartpole_rl.tasks.settings import StartSettings
 

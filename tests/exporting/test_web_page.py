@@ -13,6 +13,7 @@ import torch
 from browser import in_browser
 from shown_pages import needs_browser
 
+from cartpole_rl.arithmetic.writer import Scalar
 from cartpole_rl.envs.build import environment
 from cartpole_rl.exporting.web_page import LONGEST_LATENCY
 from cartpole_rl.physics.parameters import CartParameters
@@ -20,7 +21,6 @@ from cartpole_rl.plants.settings import SimulatedSettings
 from cartpole_rl.plants.simulated import Carts, Inputs, commands_under_way, run_carts
 from cartpole_rl.plants.specs import Numbers, OneCartPlant, PlantOutput
 from cartpole_rl.rig.hardware import nominal_encoders
-from cartpole_rl.scalar import Scalar
 from cartpole_rl.workflows.build import TrainedAgent, exported_agent, network_of, new_agent
 from cartpole_rl.workflows.config import TrainConfig, load_settings
 from cartpole_rl.workflows.export import files_of

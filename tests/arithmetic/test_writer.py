@@ -11,6 +11,7 @@ import torch
 from operations import AWKWARD, OPERATIONS, PAIRS
 from torch import Tensor
 
+from cartpole_rl.arithmetic.writer import Scalar, plain
 from cartpole_rl.choices import choice
 from cartpole_rl.envs.perception import Previous, guarded, perceive, perceive_first
 from cartpole_rl.envs.settings import GuardedPole, ObservationSettings, TrackGuard
@@ -21,7 +22,6 @@ from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.plants.simulated import Carts, Inputs, run_carts
 from cartpole_rl.plants.specs import PlantOutput
 from cartpole_rl.rig.hardware import nominal_encoders
-from cartpole_rl.scalar import Scalar, plain
 from cartpole_rl.tasks.features import Measured, ObservationKind
 from cartpole_rl.tasks.rewards import Reward
 from cartpole_rl.tasks.settings import RewardSettings, TaskSettings
