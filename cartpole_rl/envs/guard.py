@@ -93,28 +93,29 @@ def centre_of_mass(motion: Measured, pole: GuardedPole, length: Tensor | None) -
     return Centre(mass, reach, reach * torch.sin(motion.theta), motion.x_dot + turning)
 
 
-def stopping_distance(x_dot: Number, guard: TrackGuard) -> Number:
+def stopping_distance(x_dot: Number, guard: TrackGuard, centre: Centre | None = None) -> Number | Tensor:
     """Return the way to the right, m, that a cart of speed `x_dot` m/s makes under full motor to the left.
 
-    The guard is one without a pole.
+    `centre` is given where the guard has a pole.
     """
-    return guard.margin + guard.delay * x_dot + x_dot * abs(x_dot) / (2 * guard.deceleration)
+    way = guard.margin + guard.delay * x_dot
+    if centre is None:
+        return way + x_dot * abs(x_dot) / (2 * guard.deceleration)
+    assert guard.pole is not None
+    return way + guard.pole.swing * (centre.reach + centre.offset) + centre.braked / (2 * guard.deceleration)
 
 
-def guard_side(x: Number, x_dot: Number, track_end: Number | float, guard: TrackGuard) -> Number:
-    """Return the direction of the full motor of a guard without a pole, as `guard_direction` does.
+def guard_side(
+    x: Number, x_dot: Number, track_end: Number | float, guard: TrackGuard, centre: Centre | None = None
+) -> Number | Tensor:
+    """Return the direction of the full motor of a single guard, as `guard_direction` does.
 
-    `x` m from the middle of the track, `x_dot` m/s, `track_end` m, all floats or [N].
+    `x` m from the middle of the track, `x_dot` m/s, `track_end` m, all floats or [N]; `centre` as above.
     """
-    too_far_right = x + stopping_distance(x_dot, guard) > track_end
-    too_far_left = -x + stopping_distance(-x_dot, guard) > track_end
+    mirrored = None if centre is None else centre.mirrored
+    too_far_right = x + stopping_distance(x_dot, guard, centre) > track_end
+    too_far_left = -x + stopping_distance(-x_dot, guard, mirrored) > track_end
     return 1 * too_far_left - 1 * too_far_right
-
-
-def swinging_distance(x_dot: Tensor, centre: Centre, guard: TrackGuard, pole: GuardedPole) -> Tensor:
-    """Return the way to the right, m, that a cart with a pole makes under full motor to the left."""
-    braked = centre.braked / (2 * guard.deceleration)
-    return guard.margin + guard.delay * x_dot + pole.swing * (centre.reach + centre.offset) + braked
 
 
 def guard_direction(
@@ -124,21 +125,15 @@ def guard_direction(
 
     `track_end` [N] is m from the middle of the track; `length` [N] m is the pole's, if it is observed.
     """
-    direction, *others = (own_direction(motion, track_end, each, length) for each in guard.each)
+
+    def side(each: TrackGuard) -> Tensor:
+        centre = None if each.pole is None else centre_of_mass(motion, each.pole, length)
+        return guard_side(motion.x, motion.x_dot, track_end, each, centre)
+
+    direction, *others = map(side, guard.each)
     for other in others:
         direction = torch.where(direction == 0, other, direction)
     return direction
-
-
-def own_direction(motion: Measured, track_end: Tensor, guard: TrackGuard, length: Tensor | None) -> Tensor:
-    """Return the direction of this guard alone, without the second one."""
-    x, x_dot = motion.x, motion.x_dot
-    if guard.pole is None:
-        return guard_side(x, x_dot, track_end, guard)
-    centre = centre_of_mass(motion, guard.pole, length)
-    right = swinging_distance(x_dot, centre, guard, guard.pole)
-    left = swinging_distance(-x_dot, centre.mirrored, guard, guard.pole)
-    return 1 * (-x + left > track_end) - 1 * (x + right > track_end)
 
 
 # the fit

@@ -14,7 +14,7 @@ import yaml
 from command_line import ENSEMBLE, ONCE, TINY, Outcome, in_process
 
 from cartpole_rl.envs.build import driven_carts, simulated_env, with_fitted_guard
-from cartpole_rl.envs.guard import centre_of_mass, swinging_distance
+from cartpole_rl.envs.guard import centre_of_mass, stopping_distance
 from cartpole_rl.evaluation.recordings import read_recording, write_recording
 from cartpole_rl.plants.learned import load_model, save_model
 from cartpole_rl.run_folder import experiments
@@ -145,7 +145,7 @@ def test_its_guard_is_that_of_its_carts(learned: tuple[Path, Outcome], tmp_path:
     own, wide = (with_fitted_guard(config, plant).guard.active for plant in (config.plant, None))
     hanging = Measured(*torch.tensor([[0.0], [1.0], [math.pi], [0.0]]))
     ways = [
-        swinging_distance(hanging.x_dot, centre_of_mass(hanging, guard.pole, None), guard, guard.pole)
+        stopping_distance(hanging.x_dot, guard, centre_of_mass(hanging, guard.pole, None))
         for guard in (own, wide)
     ]
     assert ways[0] > ways[1] + 0.03

@@ -28,7 +28,7 @@ from cartpole_rl.envs.guard import (
     guard_direction,
     guard_side,
     least_bound,
-    swinging_distance,
+    stopping_distance,
 )
 from cartpole_rl.envs.settings import GuardedPole, TrackGuard
 from cartpole_rl.errors import ConfigError
@@ -226,7 +226,7 @@ def test_the_share_of_brakings_within_the_bound(quantile: float, cart: dict[str,
     guard = settings.guard.active
     found = braking_distances(randomizer(settings), settings.actions.motors, models, settings.control_period)
     centre = centre_of_mass(found.motion, guard.pole, None)
-    within = found.way <= swinging_distance(found.motion.x_dot, centre, guard, guard.pole)
+    within = found.way <= stopping_distance(found.motion.x_dot, guard, centre)
     for half in (found.rightward, ~found.rightward):
         assert within[half].float().mean() > quantile - 0.005
 
