@@ -11,10 +11,9 @@ import logging
 import torch
 from torch import Tensor, nn
 
+from cartpole_rl.agents.own import METADATA
 from cartpole_rl.exporting.agent import ExportedAgent
 from cartpole_rl.tasks.settings import NO_ACTION
-
-METADATA = "cartpole_rl"
 
 
 class GreedyPolicy(nn.Module):
