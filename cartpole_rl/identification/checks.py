@@ -15,6 +15,7 @@ from cartpole_rl.identification.prediction import REPORTED, Replayed, away_from_
 from cartpole_rl.identification.rollout import Dynamics
 from cartpole_rl.identification.sensors import Motion, question_sensors, samples_of
 from cartpole_rl.identification.windows import mean_gap, naming
+from cartpole_rl.plants.measured import SUDDEN_CART
 from cartpole_rl.rig.hardware import Hardware
 from cartpole_rl.tasks.episode import Episode, wrap
 
@@ -32,7 +33,6 @@ FROZEN = 1.0  # s
 ZERO_INTERVAL = 0.02  # rad, 95 % of the zero that motion tells
 STRONG, MOVES = 150, 0.03  # motor value; m of cart that move a hanging pole
 STRONG_SHARE = 0.3  # of a standstill's motor values: no cart with a swinging pole stands still under so many
-SUDDEN = 0.25  # m/s: from here to standing exactly still within a period
 TOLERANCE = 2.0  # counts by which positions in SI units may differ from counts
 SIGNIFICANT = 0.2  # correlation from which its sign is certain
 UNEXPLAINED = 0.5  # RMS error of a prediction over the RMS motion; about 0.02 for a cart of this kind
@@ -294,7 +294,7 @@ def _check_encoders(episode: Episode, period: float) -> None:
                 )
     speed = np.abs(np.diff(cart)) * episode.encoders.metres / period
     for first, last in _standstills(cart):
-        if last - first >= 5 and first > 0 and speed[first - 1] > SUDDEN:
+        if last - first >= 5 and first > 0 and speed[first - 1] > SUDDEN_CART:
             raise RecordingError(
                 f"the cart stops dead at {cart[first]} counts from "
                 f"{speed[first - 1]:.2f} m/s at {first * period:.1f} s: it hit a stop, or its count is "

@@ -21,6 +21,7 @@ from cartpole_rl.identification.checks import shows_motion
 from cartpole_rl.identification.experiments import recording
 from cartpole_rl.identification.settings import Direction, Layout, TimeColumn
 from cartpole_rl.identification.windows import UNEVEN, history_periods, mean_gap
+from cartpole_rl.plants.measured import FASTEST_CART
 from cartpole_rl.rig.hardware import LARGEST_MOTOR, Encoders
 from cartpole_rl.tasks.episode import Ending, Episode
 from cartpole_rl.wire.messages import MOST_COUNTS
@@ -29,7 +30,6 @@ Array = NDArray[np.float64]
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 TURN = {"rad": 2 * np.pi, "deg": 360.0, "turn": 1.0}
-FASTEST = 5.0  # m/s: no cart is faster
 LEAP, SMALL_LEAP = 0.25, 0.05  # turns beside whole ones between two rows; the latter where it is over a turn
 FEW, LEAST_JUMPS = 50, 3  # values of a column that does not turn; jumps that tell where it wraps
 MOST_OF_RANGE, ALIKE = 0.8, 0.02  # shares of a column's range, and of a jump by which others may differ
@@ -60,7 +60,7 @@ class Report(NamedTuple):
     leap: str  # the first of them
     wrap: float  # turns by which the angle jumps where its column wraps; 0 if it does not
     anew: bool  # they are of one size, as where a counter begins anew
-    jumps: int  # rows to which the cart would be faster than FASTEST
+    jumps: int  # rows to which the cart would be faster than FASTEST_CART
     stale: float  # share of the rows of a turning pole that have the states of the row before
     period: float  # s
     gap: float  # s, the mean between rows, as `Rows.period`
@@ -179,6 +179,7 @@ def cut_log(read: Rows, layout: Layout, encoders: Encoders, period: float) -> Lo
             left_out[STANDING] = left_out.get(STANDING, 0) + len(rows)
     alone = ~np.concatenate(([False], together)) & ~np.concatenate((together, [False])) & counted
     left_out["alone between gaps"] = int(alone.sum())
+    too_far = np.abs(np.diff(x)) > FASTEST_CART * np.maximum(gaps, period)  # stamps of a host are late
     report = Report(
         len(time) + read.unknown + read.repeated,
         {reason: number for reason, number in left_out.items() if number},
@@ -190,7 +191,7 @@ def cut_log(read: Rows, layout: Layout, encoders: Encoders, period: float) -> Lo
         f"row {read.places[leaps[0]]} of {path.name}" if len(leaps) else "",
         wrap_of(theta, together),
         len(leaps) > 0 and float(np.ptp(turned[leaps - 1])) < SMALL_LEAP,
-        int((np.abs(np.diff(x)) > FASTEST * np.maximum(gaps, period)).sum()),  # stamps of a host are late
+        int(too_far.sum()),
         stale_share(x, theta),
         period,
         read.period,

@@ -13,16 +13,19 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from cartpole_rl.emulator import guards
 from cartpole_rl.rig.hardware import Hardware, nominal_hardware
 from cartpole_rl.tasks.episode import Array, Ending, Episode, wrap
 from cartpole_rl.wire.messages import Fault
 
 LOGGER = logging.getLogger(__name__)
 
-FASTEST = 5.0, 16.0  # m/s of the cart, turns/s of the pole
+FASTEST_CART = guards.FASTEST_CART / 1e9  # m/s: no cart is faster
+FASTEST = FASTEST_CART, guards.FASTEST_POLE  # m/s of the cart, turns/s of the pole
 PUSHED = 0.1 - 1e-6  # s of hard pushes in each direction
-SPEED_CHANGE = 0.2  # m/s up and down that turn any pole
-SUDDEN = 0.25, 0.05  # m/s, turns/s: a dead stop,
+SPEED_CHANGE = guards.SPEED_CHANGE / 1e6  # m/s up and down that turn any pole
+SUDDEN_CART = 0.25  # m/s: from here to standing exactly still
+SUDDEN = SUDDEN_CART, 0.05  # m/s, turns/s: a dead stop,
 FINE = 2000  # counts a turn: a pole that is balanced may stay within one coarser count
 STILL = 0.5  # s, if the count does not change for as long after it
 LEANING = 0.025 + 0.008  # rad: largest error of the encoder's zero, and what friction holds

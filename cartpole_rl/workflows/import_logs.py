@@ -19,7 +19,6 @@ from cartpole_rl.evaluation.exchange import read_mcap, read_minari
 from cartpole_rl.evaluation.recordings import LENGTH, write_recording
 from cartpole_rl.identification.checks import motions
 from cartpole_rl.identification.logs import (
-    FASTEST,
     LONGEST_GAP,
     STALE,
     TURN,
@@ -35,6 +34,7 @@ from cartpole_rl.identification.logs import (
 )
 from cartpole_rl.identification.sensors import Estimate, Sensors, question_sensors
 from cartpole_rl.identification.settings import ImportConfig, Layout, log_files
+from cartpole_rl.plants.measured import FASTEST_CART
 from cartpole_rl.rig.hardware import nominal_hardware
 from cartpole_rl.run_folder import RECORDINGS, write_config, write_json
 from cartpole_rl.terminal import as_word, print_message, print_results, progress_bar, shown, words_given
@@ -199,8 +199,8 @@ def doubts(reports: Sequence[Report], sensors: Sensors, period: float, layout: L
         )
     if jumps := sum(each.jumps for each in reports):
         yield (
-            f"the cart would be faster than {FASTEST:g} m/s in {jumps} of {rows} rows: its counter begins "
-            "anew there, or layout.position.unit is wrong"
+            f"the cart would be faster than {FASTEST_CART:g} m/s in {jumps} of {rows} rows: its counter "
+            "begins anew there, or layout.position.unit is wrong"
         )
     stale = max(each.stale for each in reports) > STALE
     if stale:
