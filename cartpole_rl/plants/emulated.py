@@ -39,10 +39,11 @@ class CartProcess:
     """
 
     what = "the emulated cart"
+    board = ""  # the port of the board that it bridges
 
     def __init__(self, module: str, settings: str) -> None:
         """Start ``python -m module settings``, and wait for its first line."""
-        self._told = False  # somebody knows why it ended
+        self.told = False  # somebody knows why it ended
         self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 - open as long as the process
         self._process = subprocess.Popen(
             [sys.executable, "-m", module, settings],
@@ -92,7 +93,7 @@ class CartProcess:
                 process.wait(GRACE)
             except subprocess.TimeoutExpired:
                 process.kill()
-        if process.wait() not in (0, ASKED) and not self._told:
+        if process.wait() not in (0, ASKED) and not self.told:
             LOGGER.warning("%s", self._why(process.returncode))
         assert process.stdout is not None  # a pipe was asked for
         process.stdout.close()
@@ -125,7 +126,7 @@ class CartProcess:
             raise EmulatorError(f"{self.what}'s first line is not JSON with `port`: {line!r}") from error
 
     def _stderr_end(self) -> str:
-        self._told = True
+        self.told = True
         if self._stderr.closed:
             return "stderr is closed"
         length = self._stderr.seek(0, os.SEEK_END)
@@ -177,6 +178,7 @@ class BridgeProcess(CartProcess):
 
         `lever` is that of `TrackLimits`, um.
         """
+        self.board = board.port
         given = {"plant": board, "hardware": hardware, "control_period": control_period, "lever_um": lever}
         super().__init__("cartpole_rl.plants.drivers", json.dumps(given, default=BaseModel.model_dump))
 

@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, TypeAdapter, field_validator, model_validator
 
@@ -23,6 +23,9 @@ from cartpole_rl.run_folder import check_program
 from cartpole_rl.settings import Finite, Fraction, Positive, Settings
 from cartpole_rl.terminal import as_word
 
+if TYPE_CHECKING:
+    from cartpole_rl.plants.emulated import CartProcess
+
 # Homing: after connecting and after faults, and re-centring between other episodes; or before each episode.
 Rehome = Literal["once", "always"]
 
@@ -31,6 +34,7 @@ Seconds = Annotated[float, Field(gt=0, le=60)]
 Wait = Annotated[float, Field(gt=0, le=600)]  # s, for the cart or a person to move something
 
 
+Reached = tuple["SerialSettings", "CartProcess | None"]  # the settings of a cart, and what serves its port
 OF_SIMULATION = ("parameters", "randomization", "cart", "cart_friction", "pole_friction", "knock")
 
 
@@ -178,14 +182,14 @@ class EmulatedSettings(PlantSettings):
         return one_pole(emulated_pole(emulator))
 
     @contextmanager
-    def reachable(self, emulator: EmulatorSettings, hardware: Hardware) -> "Iterator[SerialSettings]":
-        """Start a hanging cart, and yield the settings to reach it. Raises EmulatorError, ConfigError."""
+    def reachable(self, emulator: EmulatorSettings, hardware: Hardware) -> "Iterator[Reached]":
+        """Start a hanging cart, and yield how to reach it. Raises EmulatorError, ConfigError."""
         from cartpole_rl.plants.emulated import EmulatedCart  # which imports this module
 
         if emulator.start != "hanging":
             raise ConfigError(f"emulator.start={emulator.start}: this cart starts hanging; leave it out")
         with EmulatedCart(emulator) as cart:
-            yield cart.settings
+            yield cart.settings, cart
 
 
 def emulated_pole(emulator: EmulatorSettings) -> Pole:
@@ -266,9 +270,9 @@ class SerialSettings(RealCartSettings):
         return "" if self.policy is None else f"plant.policy={self.policy}"
 
     @contextmanager
-    def reachable(self, emulator: EmulatorSettings, hardware: Hardware) -> "Iterator[SerialSettings]":
+    def reachable(self, emulator: EmulatorSettings, hardware: Hardware) -> "Iterator[Reached]":
         """Yield these settings."""
-        yield self
+        yield self, None
 
 
 class BoardSettings(RealCartSettings):
@@ -323,12 +327,12 @@ class BoardSettings(RealCartSettings):
         return SerialSettings(**self.model_dump(include=shared), port=port)
 
     @contextmanager
-    def reachable(self, emulator: EmulatorSettings, hardware: Hardware) -> "Iterator[SerialSettings]":
-        """Start a bridge, and yield the settings to reach it. Raises LinkError, PortError, ConfigError."""
+    def reachable(self, emulator: EmulatorSettings, hardware: Hardware) -> "Iterator[Reached]":
+        """Start a bridge, and yield how to reach it. Raises LinkError, PortError, ConfigError."""
         from cartpole_rl.plants.emulated import BridgeProcess  # which imports this module
 
         with BridgeProcess(self, hardware, None) as bridge:
-            yield self.over(bridge.port)
+            yield self.over(bridge.port), bridge
 
 
 EXPONENT = re.compile(r"\de-\d", re.IGNORECASE)

@@ -25,8 +25,10 @@ def check_cart(config: PreflightConfig) -> None:
     asked = asking(plant, hardware, confirm) if isinstance(plant, BoardSettings) else lambda: None
     finding: Finding | None = None
     with (
-        plant.reachable(config.emulator.of_cart(config.cart), hardware) as settings,
-        closing(SerialCart(settings, hardware, asked)) as cart,  # it is disarmed and closed at the end
+        plant.reachable(config.emulator.of_cart(config.cart), hardware) as (settings, server),
+        closing(
+            SerialCart(settings, hardware, asked, server)
+        ) as cart,  # it is disarmed and closed at the end
     ):
         for finding in preflight(cart, faults):
             print(finding, flush=True)

@@ -8,9 +8,9 @@ which states count as lost, repeated or late. The protocol is described in `docs
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
-from cartpole_rl.errors import LinkError, PlantError
+from cartpole_rl.errors import LinkError, PlantError, PortError
 from cartpole_rl.plants.serial.connection import WATCHDOG_PERIODS, Connection
 from cartpole_rl.plants.serial.errors import RefusedError, check_limits, check_rig, fault_error
 from cartpole_rl.plants.serial.link import SerialLink, now
@@ -35,6 +35,9 @@ from cartpole_rl.wire.messages import (
     Stop,
     microseconds_between,
 )
+
+if TYPE_CHECKING:
+    from cartpole_rl.plants.emulated import CartProcess
 
 LOGGER = logging.getLogger(__name__)
 
@@ -67,9 +70,14 @@ class SerialCart:
         settings: SerialSettings,
         hardware: Hardware | None = None,
         before_homing: Callable[[], None] = lambda: None,
+        server: "CartProcess | None" = None,
     ) -> None:
-        """`hardware` is that of the cart's file, ip02's if it is None. `before_homing` may ask a person."""
+        """`hardware` is that of the cart's file, ip02's if it is None. `before_homing` may ask a person.
+
+        `server` is the process that serves the port, if there is one: once it has ended, it says why.
+        """
         self.settings, self.hardware = settings, hardware or nominal_hardware()
+        self._server = server
         self._before_homing = before_homing
         self.port = settings.port  # once opened, the one that "auto" was resolved to
         self._usb: UsbPort | None = None  # the cart's device, once it answered, if it is on USB
@@ -96,12 +104,19 @@ class SerialCart:
         """
         if self._open_connection is not None:
             return self.information
-        settings = self.settings
+        settings, server = self.settings, self._server
+        if server is not None and server.died:
+            raise LinkError(server.died)  # its port may be another process's by now
         self.port = port_of(self._usb, settings.port) if self._usb else resolved_port(settings.port)
-        port = open_port(self.port, settings.baud, settings.write_timeout)
+        try:
+            port = open_port(self.port, settings.baud, settings.write_timeout)
+        except PortError as error:
+            if server is not None and (why := server.death()):
+                raise LinkError(why) from error
+            raise
         self._looked_again = False
         with self._tracker.uncounted() as uncounted:
-            link = SerialLink(port, uncounted)
+            link = SerialLink(port, uncounted, server)
             self._open_connection = Connection(link, settings, self._tracker)
             try:
                 self._note(self._open_connection.shake_hands())
@@ -120,12 +135,14 @@ class SerialCart:
         """Set the motor to 0, disarm, give the port back. Raises only what interrupts it, such as Ctrl-C."""
         if self._open_connection is None:
             return
+        told = self._server is not None and self._server.told
         try:
             self._stop(LAST_STOP if self._stop_unanswered else LONGEST_STOP)
         except PlantError as error:
-            LOGGER.warning(
-                "the cart did not confirm that it is disarmed (%s): its motor may still be on", error
-            )
+            if not told:  # by a bridge that ended; it says whether the motor may be on
+                LOGGER.warning(
+                    "the cart did not confirm that it is disarmed (%s): its motor may still be on", error
+                )
         except BaseException:  # a signal, before STOP was answered
             with suppress(PlantError):
                 self._stop(LAST_STOP)

@@ -6,6 +6,7 @@ A receiver that starts in the middle of a frame, or receives noise, is synchroni
 import os
 import time
 from contextlib import suppress
+from typing import TYPE_CHECKING
 
 import serial
 
@@ -14,6 +15,9 @@ from cartpole_rl.plants.serial.port import set_exclusive
 from cartpole_rl.plants.serial.tracking import LinkStatistics
 from cartpole_rl.wire.frames import Frame, FrameSplitter, decode_frame, encode_frame
 from cartpole_rl.wire.messages import Message
+
+if TYPE_CHECKING:
+    from cartpole_rl.plants.emulated import CartProcess
 
 # Linux's has this name; macOS counts the time asleep in its CLOCK_MONOTONIC, and Windows in perf_counter
 _CLOCK: int | None = getattr(time, "CLOCK_BOOTTIME", getattr(time, "CLOCK_MONOTONIC", None))
@@ -33,10 +37,13 @@ class WriteTimeoutError(LinkError):
 
 
 class SerialLink:
-    """Both directions of one port. Times are those of `now`, in s."""
+    """Both directions of one port, which a process `server` may serve. Times are those of `now`, in s."""
 
-    def __init__(self, port: serial.SerialBase, statistics: LinkStatistics) -> None:
+    def __init__(
+        self, port: serial.SerialBase, statistics: LinkStatistics, server: "CartProcess | None" = None
+    ) -> None:
         self._port = port
+        self._board, self._why_ended = (server.board, server.death) if server else ("", str)
         self._splitter = FrameSplitter()
         self.statistics = statistics
         self.sequence = os.urandom(1)[0]  # of the newest frame sent; unlike that of the last host
@@ -47,8 +54,8 @@ class SerialLink:
 
     @property
     def port(self) -> str:
-        """Path or URL of the port."""
-        return str(self._port.port)
+        """Path or URL of the port, as a person knows it: of a bridge, that of its board."""
+        return self._board or str(self._port.port)
 
     def send(self, *messages: Message) -> int:
         """Write the messages in one go and return the sequence of the last. Raises LinkError."""
@@ -131,6 +138,8 @@ class SerialLink:
             return None
 
     def _broken(self, what: str, error: OSError) -> LinkError:
+        """Return an error with the reason of the server, if it has ended."""
         return LinkError(
-            f"{self.port} cannot be {what} any more: {error}; is the cart unplugged or without power?"
+            self._why_ended()
+            or f"{self.port} cannot be {what} any more: {error}; is the cart unplugged or without power?"
         )

@@ -75,7 +75,7 @@ class SerialPlant(OneCartPlant):
     ) -> None:
         super().__init__(hardware)
         self.settings = settings
-        self.cart = SerialCart(settings, self.hardware, before_homing)
+        self.cart = SerialCart(settings, self.hardware, before_homing, owned)
         self.ended_by = ""
         self.last_error: PlantError | None = None
         self.on_board = False  # resets start the policy on the cart's board; `listen_one` passes periods
@@ -155,10 +155,8 @@ class SerialPlant(OneCartPlant):
             if self.before_start is not None:
                 self.before_start()
             self._state = self._armed()
-        except BaseException as error:
+        except BaseException:
             self.halt()  # at once: what unwinds before `close`, such as a view, may block
-            if isinstance(error, LinkError) and (why := self._why_lost()):
-                raise LinkError(why) from error
             raise
         self._turns = self._whole_turns()
         self._drove = 0
@@ -276,8 +274,6 @@ class SerialPlant(OneCartPlant):
         self._preparation.require_homing()
         if isinstance(error, LinkError):
             self.cart.close()
-            if why := self._why_lost():
-                self.last_error = LinkError(why)
         else:
             self.halt()
             if isinstance(error, FaultError):
@@ -329,20 +325,9 @@ class SerialPlant(OneCartPlant):
                     ) from error
             time.sleep(REOPENED)
 
-    def _why_lost(self) -> str:
-        """Return the reason why the process that serves the cart has ended; empty if it has not."""
-        return self._owned.death() if self._owned is not None else ""
-
     def _connect(self) -> None:
         """Open the port and check which rig the cart is. Raises PortError, LinkError, NotReadyError."""
-        if self._owned is not None and self._owned.died:
-            raise LinkError(self._owned.died)  # its port may be another process's by now
-        try:
-            self.cart.open()
-        except (PortError, LinkError) as error:
-            if why := self._why_lost():
-                raise LinkError(why) from error
-            raise
+        self.cart.open()
         check_rig(self.cart.information, self.cart.flags, self.hardware)
 
 

@@ -20,9 +20,11 @@ import pytest
 
 from cartpole_rl.choices import choice
 from cartpole_rl.emulator.settings import EmulatorSettings
-from cartpole_rl.errors import ConfigError, LinkError, PlantError
+from cartpole_rl.errors import ConfigError, EmulatorError, LinkError, PlantError
 from cartpole_rl.plants.emulated import BridgeProcess
+from cartpole_rl.plants.serial.cart import SerialCart
 from cartpole_rl.plants.serial.plant import SerialPlant, cart_on_port
+from cartpole_rl.plants.serial.preflight import preflight
 from cartpole_rl.plants.serial.preparation import Confirm, always, nobody
 from cartpole_rl.plants.settings import DriverSettings, TextSettings
 from cartpole_rl.rig.hardware import hardware_of
@@ -200,6 +202,19 @@ def test_a_board_that_fails_is_stopped(options: dict[str, Any], why: str, tmp_pa
         if options:
             assert abs(last_speed(journal)) < 0.02  # by what was sent: no measurement tells
             assert float(taken(journal)[-1][1].removeprefix("a=")) == 0
+
+
+def test_preflight_says_why_a_board_is_lost(caplog: pytest.LogCaptureFixture) -> None:
+    """Not that an internal port cannot be read, nor that a stopped motor may still be on."""
+    with board(at=2, silent=True) as (port, _), pytest.raises(EmulatorError, match="nothing was received"):
+        text = TextSettings(**STEPPER, port=port)
+        with (
+            text.reachable(EmulatorSettings(), RIG) as (settings, server),
+            closing(SerialCart(settings, RIG, server=server)) as cart,
+        ):
+            *_, last = preflight(cart)
+            assert last.words.startswith(f"no measurement came from {port} for")
+    assert "may still be on" not in caplog.text
 
 
 @pytest.mark.nightly

@@ -444,7 +444,7 @@ def test_a_port_that_is_gone_for_a_moment_is_opened_again(peer: CartPeer, tmp_pa
 
 
 class Owned:
-    closed, died = False, ""
+    closed, told, died, board = False, False, "", ""
 
     def death(self) -> str:
         return ""
