@@ -28,6 +28,7 @@ FEW_LINES, QUEUED = 3, 0.1  # lines and s: so many that wait for so long are too
 WHOLE = re.compile(r"[+-]?[0-9]+")
 NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)(e[+-]?[0-9]+)?", re.IGNORECASE)
 LARGEST_COUNT = 2**31
+FINE, FEW_WHOLE = 2, 5  # counts in a unit whose numbers need decimals; so many without any are in counts
 MICROSECONDS = {"us": 1, "ms": 1_000, "s": 1_000_000}
 
 
@@ -44,6 +45,9 @@ class TextDriver(Driver):
         self._pole_counts = {"counts": 1.0, "deg": math.radians(1) / radians, "rad": 1 / radians}[
             settings.pole_unit
         ]
+        # the numbers of a column that has had no decimals, though its unit has many counts
+        per_unit = {"cart": self._cart_counts, "pole": self._pole_counts}
+        self._whole: dict[str, set[str]] = {name: set() for name, counts in per_unit.items() if counts > FINE}
         self._line: serial.SerialBase | None = None
         self._pending = b""
         self._dropping = False  # until the next line: this one is too long
@@ -72,7 +76,7 @@ class TextDriver(Driver):
             self._pending += self._received(deadline)
             if len(self._pending) > LONGEST_LINE and b"\n" not in self._pending:
                 if not self._dropping:
-                    self._refuse(self._pending)
+                    self._refuse(self._pending, found=rf", {LONGEST_LINE} bytes without \n,")
                 self._pending, self._dropping = b"", True
 
     def send(self, value: float) -> None:
@@ -146,9 +150,12 @@ class TextDriver(Driver):
     def _measured(self, line: bytes) -> Measurement | None:
         """Return the measurement in a line; None, and count it as bad, if it has none."""
         settings = self.settings
-        words = line.decode("ascii", errors="replace").strip(" \t\r").split(settings.separator)
+        text = line.decode("ascii", errors="replace").strip(" \t\r")
+        if "," not in settings.separator:
+            text = text.replace(",", ".")  # the decimal comma
+        words = text.split(settings.separator)
         if len(words) != len(settings.columns):
-            self._refuse(line)
+            self._refuse(line, found=f", which has {len(words)} values,")
             return None
         try:
             cart, pole = (self._number(words[self._columns[name]], name) for name in ("cart", "pole"))
@@ -180,15 +187,28 @@ class TextDriver(Driver):
         return self._ticks * unit
 
     def _number(self, word: str, column: str) -> float:
-        """Return the number of a column. Raises ValueError."""
-        counts = getattr(self.settings, f"{column}_unit") == "counts"
+        """Return the number of a column. Raises ValueError; LinkError if the unit seems wrong."""
+        unit = getattr(self.settings, f"{column}_unit")
+        counts = unit == "counts"
         if "." in word and counts:
             raise ValueError(f"{column} has decimals, so it is not in counts: give plant.{column}_unit")
-        return float(matching(WHOLE if counts else NUMBER, word))
+        number = matching(WHOLE if counts else NUMBER, word)
+        if not WHOLE.fullmatch(number):
+            self._whole.pop(column, None)
+        elif column in self._whole:
+            self._whole[column].add(number)
+            if len(self._whole[column]) >= FEW_WHOLE:
+                raise LinkError(
+                    f"{self.port}: {column} never has decimals, so it seems to be in counts: leave out "
+                    f"plant.{column}_unit={unit}, or send decimals, or give cart= a count of 1 {unit}"
+                )
+        return float(number)
 
-    def _refuse(self, line: bytes, why: str = "") -> None:
+    def _refuse(self, line: bytes, why: str = "", found: str = "") -> None:
         self.bad += 1
-        self.why_bad = f"{line[:60]!r} is not {self.settings.separator.join(self.settings.columns)}{why}"
+        self.why_bad = (
+            f"{line[:60]!r}{found} is not {self.settings.separator.join(self.settings.columns)}{why}"
+        )
 
 
 def matching(pattern: re.Pattern[str], word: str) -> str:

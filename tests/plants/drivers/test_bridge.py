@@ -11,7 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from itertools import count, pairwise
 from pathlib import Path
 from typing import Any
@@ -206,14 +206,15 @@ def test_a_board_that_fails_is_stopped(options: dict[str, Any], why: str, tmp_pa
 
 def test_preflight_says_why_a_board_is_lost(caplog: pytest.LogCaptureFixture) -> None:
     """Not that an internal port cannot be read, nor that a stopped motor may still be on."""
-    with board(at=2, silent=True) as (port, _), pytest.raises(EmulatorError, match="nothing was received"):
-        text = TextSettings(**STEPPER, port=port)
-        with (
-            text.reachable(EmulatorSettings(), RIG) as (settings, server),
-            closing(SerialCart(settings, RIG, server=server)) as cart,
-        ):
-            *_, last = preflight(cart)
-            assert last.words.startswith(f"no measurement came from {port} for")
+    words = ""
+    with (
+        suppress(EmulatorError),  # of the bridge that has ended
+        board(at=2, silent=True) as (port, _),
+        TextSettings(**STEPPER, port=port).reachable(EmulatorSettings(), RIG) as (settings, server),
+        closing(SerialCart(settings, RIG, server=server)) as cart,
+    ):
+        words = [*preflight(cart)][-1].words
+    assert words.startswith(f"no measurement came from {port} for")
     assert "may still be on" not in caplog.text
 
 

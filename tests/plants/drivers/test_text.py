@@ -70,6 +70,11 @@ UNITS = {
         f"1.5,0.001,{math.pi}\n".encode(),
         Measurement(40, 2048, 1_500_000),
     ),
+    "decimal commas": (
+        {"cart_unit": "mm", "pole_unit": "deg", "separator": ";"},
+        b"7;-1,0;89,9999999\r\n",
+        Measurement(-40, 1024, 7),
+    ),
     "small numbers": (
         {"cart_unit": "m", "pole_unit": "rad"},
         b"1,-1.0E-3,+.0\n",
@@ -111,6 +116,29 @@ BAD = [
 def test_counts_with_decimals_name_the_unit(line: Line) -> None:
     assert line.read(b"1,0.00,3\n", b"4,5,6\n") == Measurement(5, 6, 4)
     assert line.driver.why_bad.endswith("cart has decimals, so it is not in counts: give plant.cart_unit")
+
+
+@pytest.mark.parametrize(
+    ("bad", "why"), [(b"1,2,5,3,5", "which has 5 values,"), (b"1,2,3\r" * 40, r"200 bytes without \n,")]
+)
+def test_a_line_of_another_form_says_what_it_has(bad: bytes, why: str, line: Line) -> None:
+    assert line.read(bad, timeout=0.05) is None
+    assert line.read(b"\n", b"4,5,6\n") == Measurement(5, 6, 4)
+    assert line.driver.why_bad.endswith(f" {why} is not time,cart,pole")
+
+
+@pytest.mark.parametrize("fraction", ["", ".5"])
+def test_raw_counts_are_not_taken_for_degrees(fraction: str) -> None:
+    """A column of a finer scale that never has decimals is in counts, however far it moves."""
+    numbers = [f"{place},{2 * place},{977 + place}{fraction}\n".encode() for place in range(6)]
+    with closing(Line(pole_unit="deg")) as line:
+        for number in numbers[:4]:
+            line.read(number)
+        if fraction:
+            assert line.read(*numbers[4:])
+        else:
+            with pytest.raises(LinkError, match=r"leave out plant\.pole_unit=deg, or send decimals"):
+                line.read(*numbers[4:])
 
 
 def test_a_time_with_decimals_names_the_unit(line: Line) -> None:
