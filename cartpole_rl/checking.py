@@ -102,7 +102,11 @@ def _complaint(
             taken = detail["ctx"]["expected_tags"].replace("'", "")
             return f"{key}={detail['ctx']['tag']}: this command takes {taken}"
         case "union_tag_not_found":  # a plant's file without its kind
-            return f"{key}: kind is missing; give {key}={', '.join(kinds(schema, key))}"
+            known = kinds(schema, key)
+            return (
+                f"{key}: kind is missing; give {key}={', '.join(known)}, or begin its file with one of them, "
+                f"as in `defaults: [{known[-1]}]`"
+            )
     given = detail["input"]
     value = json.dumps(given) if given is None or isinstance(given, bool) else given  # as it was typed
     named = f"{key}={value}" if isinstance(value, int | float | str) else key

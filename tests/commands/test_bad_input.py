@@ -152,7 +152,8 @@ def test_a_plant_file_without_a_kind(tmp_path: Path) -> None:
     done = in_process("finetune", "run=run", "plant=mine.yaml", folder=tmp_path)
     assert (
         done.complaint
-        == "cartpole-finetune: plant: kind is missing; give plant=emulated, serial, text, driver"
+        == "cartpole-finetune: plant: kind is missing; give plant=emulated, serial, text, driver, or begin "
+        "its file with one of them, as in `defaults: [driver]`"
     )
     assert done.code == 2
 

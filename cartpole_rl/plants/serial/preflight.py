@@ -211,7 +211,8 @@ def link(cart: SerialCart) -> str:
     if abs(measured / period - 1) > PERIOD_TOLERANCE:
         raise NotReadyError(
             f"a period takes {measured * 1e3:.2f} ms by the cart's clock, not {period * 1e3:g} ms as it says",
-            "its firmware does too much in a period, or miscounts its time",
+            "its firmware does too much in a period, or miscounts its time; on plant=text, lines may be lost "
+            "or damaged",
         )
     slow = trip > ROUND_TRIP_SHARE * period
     if slow and not cart.is_lockstep:

@@ -204,6 +204,15 @@ def test_a_board_that_fails_is_stopped(options: dict[str, Any], why: str, tmp_pa
             assert float(taken(journal)[-1][1].removeprefix("a=")) == 0
 
 
+def test_preflight_names_lost_lines_where_periods_are_long() -> None:
+    with (
+        board(garbage=0.15) as (port, _),
+        TextSettings(**STEPPER, port=port).reachable(EmulatorSettings(), RIG) as (settings, server),
+        closing(SerialCart(settings, RIG, server=server)) as cart,
+    ):
+        assert "on plant=text, lines may be lost or damaged" in [*preflight(cart)][-1].words
+
+
 def test_preflight_says_why_a_board_is_lost(caplog: pytest.LogCaptureFixture) -> None:
     """Not that an internal port cannot be read, nor that a stopped motor may still be on."""
     words = ""
