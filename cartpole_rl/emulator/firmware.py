@@ -245,8 +245,6 @@ class Firmware:
         if self.homing:
             self._limits.release()
         else:
-            zeros = self._zeros
-            angle = pole - self._pole_zero
             if self.armed and self._limits.cart_jumped():
                 self._latch(Fault.CART_ENCODER)
             if self.armed and self._limits.pole_jumped():
@@ -254,9 +252,17 @@ class Firmware:
             if self.armed and self._limits.lost(now_us, self.motor):
                 self._latch(Fault.CART_ENCODER)
                 self._brake_blindly(now_us)
-            outward = cart - zeros.middle
-            self._limits.apply(now_us, outward, angle, zeros.half_span, self.armed, self._pressed)
+            self._apply_limits(now_us)
         self._limited |= self.motor != self._line.requested
+
+    def _apply_limits(self, now_us: int) -> None:
+        """Let the limits decide about the requested motor value, by the counts that were read last."""
+        outward, angle, half_span = (
+            self._cart - self._zeros.middle,
+            self._pole - self._pole_zero,
+            self._zeros.half_span,
+        )
+        self._limits.apply(now_us, outward, angle, half_span, self.armed, self._pressed, self._line.requested)
 
     def _obey(self, envelope: Envelope, now_us: int) -> Message | Reason | None:
         """Carry out a frame and return the answer; None for SET_MOTOR, which the next STATE acknowledges."""

@@ -3,8 +3,9 @@
 Faults are a stalled cart and implausible encoders, looked for at the end of each period. The limits know the
 cart's position and speed; they are looked at once a millisecond.
 
-Beyond the soft limit an outward motor value gives 0. A cart that runs outward too fast to stop before its
-hard limit is braked with full motor inward:
+Beyond the soft limit an outward motor value gives 0. So it does where looks are rare, if it would make the
+cart too fast to be stopped from the next look on. A cart that runs outward too fast to stop before its hard
+limit is braked with full motor inward:
 
     left - shake < speed * (lag + reaction) + speed^2 / (2 * braking)
 
@@ -34,6 +35,7 @@ from collections.abc import Mapping
 from cartpole_rl.rig.hardware import Hardware
 
 LEFT, RIGHT = 1, 2  # bits of end switches
+LARGEST = 255  # motor value
 SHORTEST_US, LONGEST_US = 5_000, 100_000  # control periods
 STALL_US = 500_000
 STALL_UM = 1000
@@ -274,10 +276,18 @@ class TrackLimits:
             self.brake = -1 if self._speed_um > 0 else 1
 
     def apply(
-        self, now_us: int, outward: int, pole: int, half_span: int, armed: bool, pressed: int = 0
+        self,
+        now_us: int,
+        outward: int,
+        pole: int,
+        half_span: int,
+        armed: bool,
+        pressed: int = 0,
+        motor: int = 0,
     ) -> None:
         """Decide for a cart `outward` counts right of the middle and a pole `pole` counts from upright.
 
+        `motor` is the value that the host wants; it counts where looks are more than 1 ms apart.
         The stops are `half_span` counts from the middle. Towards an end whose switch is `pressed`, the cart
         counts as being at that end or beyond: a false press never makes the way longer.
         """
@@ -294,6 +304,12 @@ class TrackLimits:
         self.blocked = 0
         if armed and abs(outward) >= half_span - self.soft:
             self.blocked = 1 if outward > 0 else -1
+        elif armed and motor and self._look_us and self._us:
+            side, since_us = 1 if motor > 0 else -1, self._look_us + (self._us[-1] - self._us[0]) // 2
+            push = 3 * self._braking * abs(motor) // (2 * LARGEST)  # um/s^2; `braking` is a third less
+            reached = max(0, side * speed + push * since_us // 1_000_000)
+            if self._passes(side, side * reached, outward, pole, half_span, pressed):
+                self.blocked = side
         acts = now_us < self._until_us
         self.brake = self._brake(speed, outward, pole, half_span, pressed) if acts else 0
 
@@ -305,6 +321,12 @@ class TrackLimits:
         if not REST <= abs(speed) <= JUMPED:
             return 0
         direction = 1 if speed > 0 else -1
+        return -direction if self._passes(direction, speed, outward, pole, half_span, pressed) else 0
+
+    def _passes(
+        self, direction: int, speed: int, outward: int, pole: int, half_span: int, pressed: int
+    ) -> bool:
+        """Return whether a cart with a speed in um/s passes the hard limit ahead if it is braked too late."""
         fast = self._fast_pole
         turning = max(-fast, min(fast, self._speed(self._poles)))  # counts/s
         swing = int(self._lever * (turning * self._radians) * math.cos(pole * self._radians))  # um/s
@@ -318,7 +340,7 @@ class TrackLimits:
         if self.brake == -direction:
             lag_us += RELEASE_US
         needed = size * lag_us // 1_000_000 + size * size // (2 * self._braking)
-        return -direction if left - shake < needed else 0
+        return left - shake < needed
 
     @property
     def _newest(self) -> int:

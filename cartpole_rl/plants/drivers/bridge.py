@@ -125,6 +125,12 @@ class StandIn(Firmware):
         self._stamp_us = stamp_us
         return self.tick(measured_us, *counts)
 
+    def drive(self, now_us: int) -> None:
+        """Bring the values that are due into force, within the limits: the next measurement may be far."""
+        super().drive(now_us)
+        if not self.homing:
+            self._apply_limits(now_us)
+
     def wait(self, now_us: int) -> None:
         """Apply the rules of the clock: no measurement comes."""
         self._expire(now_us)

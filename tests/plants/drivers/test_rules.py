@@ -22,7 +22,7 @@ from cartpole_rl.rig.hardware import Encoders, hardware_of
 from cartpole_rl.rig.parameters import completed
 from cartpole_rl.signals import until_stopped
 from cartpole_rl.wire.frames import encode_frame
-from cartpole_rl.wire.messages import Fault, Flags, Home, Message, Stop
+from cartpole_rl.wire.messages import Fault, Flags, Home, Message, SetMotor, Start, Stop
 
 pytestmark = pytest.mark.usefixtures("same_signals")  # the end of a bridge replaces handlers
 RIG = hardware_of(choice("cart/stepper"))  # 25 um, 4096 counts a turn
@@ -283,6 +283,32 @@ def test_the_brake_allows_for_the_time_to_the_next_line() -> None:
                 begun[look_us] = count * RIG.encoders.metres
                 break
     assert begun[0] - begun[20_000] == pytest.approx(0.02, abs=0.002)
+
+
+@pytest.mark.parametrize("board_us", [10_000, 30_000, 50_000])
+@pytest.mark.parametrize("begin", [-0.3, -0.25, -0.2, -0.15, -0.1, 0.0])  # m
+def test_full_motor_touches_no_stop_however_seldom_the_board_measures(begin: float, board_us: int) -> None:
+    cart = completed(choice("cart/ip02"))
+    rig = hardware_of(cart)
+    board = StandIn(settings(), rig, board_us, Played(settings(), rig.encoders), LEVER)
+    board.homed, now_us, x, speed, motor = True, 0, begin, 0.0, 0
+    middle = board._zeros.middle
+    board.tick(now_us, middle + rig.encoders.cart_counts(x), 0)
+    board.receive(encode_frame(Start(), 1)[:-1], now_us)
+    pole = 0
+    while board.armed and now_us < 8_000_000:
+        board.receive(encode_frame(SetMotor(255, board._ticks), 2)[:-1], now_us)
+        board.drive(now_us)
+        motor = board.motor
+        for _ in range(board_us // 1000):
+            push = max(0.0, cart["force_linear"] * abs(motor) + cart["force_offset"])
+            friction = cart["cart_viscous"] * speed + math.copysign(cart["cart_coulomb"], speed)
+            speed += 1e-3 * (math.copysign(push, motor) - friction) / cart["cart_mass"]
+            x += 1e-3 * speed
+            assert x < rig.half_span
+        now_us, pole = now_us + board_us, 10 - pole  # not frozen
+        board.tick(now_us, middle + rig.encoders.cart_counts(x), pole)
+    assert x > rig.half_span / 2
 
 
 def test_a_time_that_has_not_come_yet_is_damaged_and_costs_one_line() -> None:
