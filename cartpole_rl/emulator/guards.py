@@ -326,7 +326,7 @@ class TrackLimits:
     def _passes(
         self, direction: int, speed: int, outward: int, pole: int, half_span: int, pressed: int
     ) -> bool:
-        """Return whether a cart with a speed in um/s passes the hard limit ahead if it is braked too late."""
+        """Return True if a cart of `speed` um/s passes the hard limit ahead, braked after the next look."""
         fast = self._fast_pole
         turning = max(-fast, min(fast, self._speed(self._poles)))  # counts/s
         swing = int(self._lever * (turning * self._radians) * math.cos(pole * self._radians))  # um/s
