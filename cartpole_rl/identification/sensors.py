@@ -35,6 +35,7 @@ SWINGING = 1.0  # rad of the pole that tell its scale
 UNEXPLAINED = 0.25  # share of the acceleration of a pole that moves little; beyond it, noise may turn gravity
 NUMEROV = np.array((1, 10, 1)) / 12  # the mean of an acceleration over which a second difference extends
 EARLIEST, LATEST = 2, 4  # periods before and after its row in which a motor value may come into force
+FURTHEST = 12  # periods by which it may be shifted
 AT_ONCE = (-1.0, -0.5, 0.0, 0.5, 1.0)  # periods, delays at which a motor value shows its sign
 LONGEST_DELAY = 0.06  # s; with a short period, more than LATEST
 FINEST = 1e-3  # s between two delays that are tried, or a quarter of a period
@@ -289,19 +290,27 @@ def angle_estimates(
 def delay_estimate(
     samples: Samples, period: float, dice: np.random.Generator, on_step: Callable[[], object]
 ) -> Estimate | None:
-    """Return the time from a state to the effect of its motor value on the cart, s; None beyond `delays`.
+    """Return the time from a state to the effect of its motor value on the cart, s; None if it is not clear.
 
     By equation (3.5), the centre of mass of cart and pole accelerates under motor and friction alone.
     """
-    delays = np.arange(-EARLIEST, max(LATEST, LONGEST_DELAY / period) + 0.01, max(0.25, FINEST / period))
-    pushes, others = [samples.push(each) for each in delays], samples.other_terms
-    delays = period * delays
+    others = samples.other_terms
+
+    def unexplained(pushes: Sequence[Array], weights: Array | None = None) -> Array:
+        terms = (np.column_stack((push, others)) for push in pushes)
+        return np.array([np.mean(_regression(each, samples.x_ddot, weights)[1] ** 2) for each in terms])
+
+    first, last = -float(EARLIEST), max(LATEST, LONGEST_DELAY / period)
+    shifts = np.arange(-FURTHEST, FURTHEST + 1)
+    shift = int(shifts[unexplained([samples.push(each) for each in shifts]).argmin()])
+    if not first <= shift <= last:
+        first, last = shift - 1, shift + 1.0
+    delays = np.arange(first, last + 0.01, max(0.25, FINEST / period))
+    pushes, delays = [samples.push(each) for each in delays], period * delays
 
     def best(weights: Array | None) -> float:
         on_step()
-        terms = (np.column_stack((push, others)) for push in pushes)
-        sizes = [np.mean(_regression(each, samples.x_ddot, weights)[1] ** 2) for each in terms]
-        return _lowest(delays, np.array(sizes))
+        return _lowest(delays, unexplained(pushes, weights))
 
     found = _estimate(best(None), [best(_weights(samples.piece, dice)) for _ in range(SAMPLES)])
     return found if delays[0] < found.value < delays[-1] else None

@@ -170,12 +170,13 @@ def doubts(reports: Sequence[Report], sensors: Sensors, period: float, layout: L
             "the pole falls upwards: layout.angle.upright is half a turn off; give the recorded angle of the "
             "upright pole"
         )
+    shifted = [*_delay_doubts(sensors, period, layout)]  # which also shows as a motor of the other sign
     if sensors.push < -CORRELATED and sensors.lag < -CORRELATED:
         yield (
             "positive motor values accelerate the cart to the left, and the pole runs ahead of its cart: "
             "give the other side for layout.position.positive"
         )
-    elif sensors.push < -CORRELATED:
+    elif sensors.push < -CORRELATED and not shifted:
         yield (
             "positive motor values accelerate the cart to the left: give the other side for "
             "layout.motor.positive or layout.position.positive"
@@ -208,10 +209,10 @@ def doubts(reports: Sequence[Report], sensors: Sensors, period: float, layout: L
             "rows are written more often than the cart is measured, so states stand still between rows: give "
             "the period of the measurements as layout.period=..., and layout.resample=true"
         )
-    signs_fit = sensors.push >= -CORRELATED and sensors.lag >= -CORRELATED
-    if signs_fit and not stale:
-        yield from _scale_doubts(sensors, layout, angle_jump(reports, layout))
-        yield from _delay_doubts(sensors, period, layout)
+    if sensors.lag >= -CORRELATED and not stale:
+        if sensors.push >= -CORRELATED:
+            yield from _scale_doubts(sensors, layout, angle_jump(reports, layout))
+        yield from shifted
     yield from _time_doubts(reports, period, layout)
     unknown = sum(each.left_out.get(UNKNOWN, 0) for each in reports)
     if unknown > LACKING * rows:

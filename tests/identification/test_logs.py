@@ -583,6 +583,7 @@ BROKEN: dict[str, tuple[Callable[[Columns], Columns], list[str]]] = {
     "2 ms": (lambda each: {"t": each["t"] / 10}, ["rows are 2 ms apart.*layout.resample=true"]),
     "a row later": (lambda each: {"u": np.roll(each["u"], 1)}, ["layout.motor.row=in_force"]),
     "two rows later": (lambda each: {"u": np.roll(each["u"], 2)}, ["what was sent to the motor"]),
+    "five rows later": (lambda each: {"u": np.roll(each["u"], 5)}, ["what was sent to the motor"]),
     "position sign": (lambda each: {"x": -each["x"]}, ["the other side for layout.position.positive$"]),
     "counter of 16 bits": (
         lambda each: {"x": (each["x"] + 0.01) % 0.3},
@@ -601,6 +602,7 @@ BROKEN: dict[str, tuple[Callable[[Columns], Columns], list[str]]] = {
         ["rows are written more often than the cart is measured"],
     ),
     "three rows earlier": (lambda each: {"u": np.roll(each["u"], -3)}, ["over 50 ms later"]),
+    "eight rows earlier": (lambda each: {"u": np.roll(each["u"], -8)}, ["over 50 ms later"]),
 }
 
 
