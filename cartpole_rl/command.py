@@ -35,8 +35,9 @@ from cartpole_rl.exits import (
     exit_after_signal,
     exit_with_message,
     job_signals,
+    signal_behind,
 )
-from cartpole_rl.run_folder import CHECKPOINTS, RESUME, use_of
+from cartpole_rl.run_folder import CONFIG, RESUMABLE, has_ended, use_of
 from cartpole_rl.settings import Settings
 from cartpole_rl.sweeps import as_multirun, is_job, run_as_job, shown_jobs, sweep
 from cartpole_rl.terminal import noting, program, shown, waiting
@@ -100,13 +101,14 @@ def run_job(
     with job_signals(), noting(words):
         try:
             return run_as_job(name, folder, work) if is_job() else work()
-        except (*EXPECTED, KeyboardInterrupt, Terminated) as ended:
+        except (Exception, KeyboardInterrupt, Terminated) as raised:
+            ended = raised if isinstance(raised, EXPECTED) else signal_behind(raised) or raised
             interrupted = isinstance(ended, (*FAILED, KeyboardInterrupt, Terminated))
-            if interrupted and (folder / CHECKPOINTS / RESUME).exists():
+            if interrupted and name in RESUMABLE and (folder / CONFIG).exists() and not has_ended(folder):
                 ended.add_note(use_of(shown(folder), name))
             if isinstance(ended, EXPECTED):
                 exit_with_message(name, ended)
-            raise
+            raise ended from None
         finally:
             remove_if_empty(folder, name)
 

@@ -56,6 +56,7 @@ USES = {  # command: how its runs can be used
     "model": "cartpole-train, cartpole-evaluate and cartpole-record take it as plant=learned plant.model={0}",
     "export": "its files are for other programs; cartpole-import from={0} takes recordings back",
 }
+RESUMABLE = ("train", "finetune")  # commands that continue their runs
 RECORDING = ("record", "identify", "finetune", "import")  # commands whose runs hold recordings
 PACKAGES = ("cartpole_rl", "torch", "torchrl", "tensordict", "numpy", "hydra-core", "mujoco", "pyserial")
 
@@ -133,10 +134,10 @@ def check_program(setting: str, folder: Path, *taken: str) -> None:
 
 def use_of(folder: Path, program: str) -> str:
     """Return how a run of cartpole-<program> can be used."""
-    if program in ("train", "finetune") and not (folder / METRICS).exists():
+    if program in RESUMABLE and not (folder / METRICS).exists():
         if (folder / CHECKPOINTS / RESUME).exists():
             return f"{PREFIX}{program} {as_word('resume', folder)} continues it"
-        return f"it was stopped before its first checkpoint; start {PREFIX}{program} again"
+        return f"it was stopped before its first {CHECKPOINTS}/{RESUME}; start {PREFIX}{program} again"
     if program == "distill" and not (folder / CHECKPOINTS / LAST).exists():
         return f"it was stopped before its end; start {PREFIX}{program} again"
     if program == "identify" and not (folder / IDENTIFIED).exists():

@@ -258,6 +258,15 @@ def test_a_stopped_training_resumes_identically(tmp_path: Path) -> None:
     assert not any((run / "checkpoints/resume.pt").exists() for run in runs)
 
 
+@pytest.mark.usefixtures("without_pictures")
+def test_a_training_that_ends_before_it_can_be_resumed_says_so(tmp_path: Path) -> None:
+    interrupt_after(tmp_path / "run/checkpoints/last.pt")
+    words = (*TINY, *LONGER, "learning.checkpoint_interval=2000", "hydra.run.dir=run")
+    done = in_process("train", *words, folder=tmp_path)
+    why = "it was stopped before its first checkpoints/resume.pt; start cartpole-train again"
+    assert done.err.splitlines()[-1] == f"cartpole-train: interrupted; {why}"
+
+
 def test_a_training_resumes_with_the_carts_that_it_drew(tmp_path: Path) -> None:
     (tmp_path / "carts.csv").write_text("cart_mass\n0.9\n1.1\n")
     interrupt_after(tmp_path / "run/checkpoints/resume.pt")

@@ -79,10 +79,11 @@ def test_a_defect_in_a_job_leaves_its_traceback(tmp_path: Path, monkeypatch: pyt
     assert "Traceback" in error.read_text()
 
 
-def test_an_error_that_an_interrupt_caused_ends_the_sweep(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("is_sweep", [True, False], ids=["sweep", "single run"])
+def test_an_error_that_an_interrupt_caused_ends_the_command(
+    is_sweep: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As that of a C extension whose import is interrupted."""
+    """As that of a C extension whose import is interrupted, or of tensordict."""
 
     def interrupted() -> None:
         try:
@@ -91,9 +92,10 @@ def test_an_error_that_an_interrupt_caused_ends_the_sweep(
             raise ImportError("initialization failed") from error
 
     monkeypatch.setattr("cartpole_rl.workflows.checks.check_training", interrupted)
-    done = in_process("train", "-m", "seed=0,1", folder=tmp_path)
+    done = in_process("train", *(("-m", "seed=0,1") if is_sweep else ()), folder=tmp_path)
     assert done.code == 130
-    assert done.err.splitlines() == ["cartpole-train: job 0_seed-0", "cartpole-train: interrupted"]
+    jobs = ["cartpole-train: job 0_seed-0"] if is_sweep else []
+    assert done.err.splitlines() == [*jobs, "cartpole-train: interrupted"]
 
 
 def test_a_sweep_names_its_jobs_and_the_command_that_compares_them(tmp_path: Path) -> None:
