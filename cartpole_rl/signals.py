@@ -93,6 +93,22 @@ def until_stopped() -> Iterator[None]:
             signal.signal(number, handler)
 
 
+@contextmanager
+def kept_from_children() -> Iterator[None]:
+    """Keep SIGINT and SIGHUP from the processes that start in the block, and from multiprocessing's helper.
+
+    A terminal sends these signals to all of its processes; the one that started them ends them.
+    """
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGHUP})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def send_to_main_thread(number: int) -> None:
     """Send a signal so that it ends what the main thread waits for; on Windows it comes after that."""
     if hasattr(signal, "pthread_kill"):

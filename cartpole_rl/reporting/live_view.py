@@ -18,7 +18,7 @@ from typing import NoReturn
 from cartpole_rl.evaluation.snapshots import Memory, Snapshot, new_memory, read
 from cartpole_rl.rig.hardware import LARGEST_MOTOR
 from cartpole_rl.scheduling import giving_precedence
-from cartpole_rl.signals import end_with_parent
+from cartpole_rl.signals import end_with_parent, kept_from_children
 from cartpole_rl.tasks.rewards import UPRIGHT_ANGLE
 
 LINES = 7
@@ -46,7 +46,8 @@ class LiveView:
 
     def __enter__(self) -> "LiveView":
         if self.memory is not None:
-            self._process.start()
+            with kept_from_children():
+                self._process.start()
         return self
 
     def __exit__(self, *_: object) -> None:

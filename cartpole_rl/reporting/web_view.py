@@ -30,7 +30,7 @@ from cartpole_rl.errors import ConfigError
 from cartpole_rl.evaluation.snapshots import Memory, new_memory, read
 from cartpole_rl.reporting.live_view import LiveView
 from cartpole_rl.scheduling import lose_precedence
-from cartpole_rl.signals import end_with_parent
+from cartpole_rl.signals import end_with_parent, kept_from_children
 
 HERE = "127.0.0.1"
 HOSTS = (HERE, "localhost")  # in the Host of a request: a page elsewhere may give its own name our address
@@ -76,7 +76,8 @@ class WebView:
         self._secret = secrets.token_urlsafe(24)
         context = multiprocessing.get_context("spawn")
         self._stopped = context.RawValue("b", 0)
-        self._added = context.Queue()  # which a thread sends: a page that hangs holds up nothing
+        with kept_from_children():
+            self._added = context.Queue()  # which a thread sends: a page that hangs holds up nothing
         shown = page(title, pole_length, self.memory is None, grows)
         ignored = signal.getsignal(signal.SIGINT) == signal.SIG_IGN  # as a shell's & leaves it
         answer = STOPPED if self.memory else TRAINING_STOPPED if grows else CLOSED
@@ -92,7 +93,8 @@ class WebView:
 
     def __enter__(self) -> Self:
         print(f"view=web: {self.address}", file=sys.stderr)
-        self._process.start()
+        with kept_from_children():
+            self._process.start()
         return self
 
     def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
@@ -160,7 +162,6 @@ class Site(NamedTuple):
 
 def serve(listener: socket.socket, site: Site, added: "Queue[dict[str, Any]]") -> None:
     """Answer requests until the process is ended or its parent ends."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
     end_with_parent(site.stop.process)
     lose_precedence(LESS_URGENT)
 

@@ -114,6 +114,14 @@ def test_a_page_whose_process_is_suspended_holds_up_nothing() -> None:
     assert not view._process.is_alive()
 
 
+def test_the_page_outlives_the_signals_of_a_terminal_from_its_first_moment() -> None:
+    """The run that it belongs to ends it, and a page that is still starting leaves no traceback."""
+    with WebView("training", 0.36, [], grows=True) as view:
+        for number in (signal.SIGINT, signal.SIGHUP):
+            os.kill(view._process.pid, number)
+        assert ask(view.address, "GET", "")[0] == 200
+
+
 def press(address: str) -> None:
     """Press the button until it interrupts: Python loses an interrupt that comes in a destructor."""
     for _ in range(20):
