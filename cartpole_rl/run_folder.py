@@ -70,22 +70,21 @@ def write_config(
 ) -> None:
     """Write config.yaml and provenance.json of a run of cartpole-<program>, which starts from `agent`.
 
-    A resumed run adds its provenance to that of the first start, which is begun anew if it is damaged. Raises
-    ConfigError if a new run would overwrite another one.
+    A resumed run adds its provenance to that of the first start, which is begun anew if it is damaged, and
+    writes a config.yaml that is missing. Raises ConfigError if a new run would overwrite another one.
     """
     head = {"program": f"{PREFIX}{program}", "seed": config["seed"]}
     if agent:
         head[AGENT_HASH] = file_hash(agent)
-    if resumed:
-        first = recorded_provenance(folder) or {**head, **provenance()}
-        resumptions = [*first.get("resumed", []), provenance()]
-        write_json(folder / PROVENANCE, {**first, "resumed": resumptions})
-        return
-    if (folder / CONFIG).exists():
+    if (folder / CONFIG).exists() and not resumed:
         raise ConfigError(f"hydra.run.dir={folder}: it holds a run already; give another folder")
-    folder.mkdir(parents=True, exist_ok=True)
-    write_text(folder / CONFIG, yaml.safe_dump(dict(config), sort_keys=False))
-    write_json(folder / PROVENANCE, {**head, **provenance()})
+    if not (folder / CONFIG).exists():
+        write_text(folder / CONFIG, yaml.safe_dump(dict(config), sort_keys=False))
+    first = {**head, **provenance()}
+    if resumed:
+        first = recorded_provenance(folder) or first
+        first = {**first, "resumed": [*first.get("resumed", []), provenance()]}
+    write_json(folder / PROVENANCE, first)
 
 
 def file_hash(file: Path | bytes) -> str:

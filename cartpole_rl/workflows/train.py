@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, nullcontext, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ import torch
 
 from cartpole_rl.envs.build import driven_carts, simulated_env, with_fitted_guard
 from cartpole_rl.envs.cart_pole_env import CartPoleEnv
-from cartpole_rl.errors import ConfigError
+from cartpole_rl.errors import CheckpointError, ConfigError
 from cartpole_rl.evaluation.driving_policy import DrivingPolicy, as_weights
 from cartpole_rl.evaluation.episodes import Policy, run_batch
 from cartpole_rl.evaluation.metrics import episode_metrics
@@ -43,7 +43,17 @@ from cartpole_rl.reporting.loggers import Loggers
 from cartpole_rl.reporting.randomization import drawn_carts
 from cartpole_rl.reporting.style import save
 from cartpole_rl.reporting.web_view import WebView
-from cartpole_rl.run_folder import BEST, CHECKPOINTS, FIGURES, HISTORY, LAST, METRICS, file_hash, write_config
+from cartpole_rl.run_folder import (
+    BEST,
+    CHECKPOINTS,
+    CONFIG,
+    FIGURES,
+    HISTORY,
+    LAST,
+    METRICS,
+    file_hash,
+    write_config,
+)
 from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.terminal import (
@@ -312,15 +322,18 @@ class TrainingMonitor(Monitor):
         self._bar.close()
         if error is not None:
             self._log.fail(error)
-        self._log.close()
+        with nullcontext() if error is None else suppress(OSError):  # which would hide the error
+            self._log.close()
 
     def on_update(self, transitions: int, scalars: Scalars) -> None:
         """Log curves and advance the progress bar."""
+        self._check_folder()
         self._log.scalars(scalars, transitions)
         self._advance(transitions)
 
     def on_evaluation(self, training: Training, episodes: Sequence[Episode], is_best: bool) -> None:
         """Log scores and sometimes pictures, and write the last and the best checkpoint."""
+        self._check_folder()
         transitions, record = training.transitions, self._record(training, episodes)
         self.history.append(record)
         self._write_history()
@@ -362,6 +375,13 @@ class TrainingMonitor(Monitor):
     def _advance(self, transitions: int) -> None:
         self._bar.update(transitions - self._logged)
         self._logged = transitions
+
+    def _check_folder(self) -> None:
+        """Raise CheckpointError for a folder that is gone: what follows would be apart from the rest."""
+        if not (self.folder / CONFIG).exists():
+            raise CheckpointError(
+                f"{self.folder} was moved or removed; cartpole-train resume=<its new place> continues it"
+            )
 
     def _write_history(self) -> None:
         """Write the evaluations so far, a line each, all or none."""

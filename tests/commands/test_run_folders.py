@@ -27,6 +27,7 @@ from cartpole_rl.envs.cart_pole_env import CartPoleEnv
 from cartpole_rl.errors import LinkError
 from cartpole_rl.evaluation.episodes import Policy, run_episodes
 from cartpole_rl.files import claimed
+from cartpole_rl.learning.checkpoints import save_training
 from cartpole_rl.sweeps import LONGEST_NAME, constant_settings, job_name, run_folder
 from cartpole_rl.tasks.episode import Episode
 
@@ -265,6 +266,26 @@ def test_a_training_that_ends_before_it_can_be_resumed_says_so(tmp_path: Path) -
     done = in_process("train", *words, folder=tmp_path)
     why = "it was stopped before its first checkpoints/resume.pt; start cartpole-train again"
     assert done.err.splitlines()[-1] == f"cartpole-train: interrupted; {why}"
+
+
+@pytest.mark.usefixtures("without_pictures")
+def test_a_training_ends_where_its_folder_was_moved_and_continues_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def moving(run: Path, *state: Any) -> None:
+        save_training(run, *state)
+        run.rename(tmp_path / "moved")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("cartpole_rl.workflows.monitor.save_training", moving)
+        done = in_process("train", *TINY, "hydra.run.dir=run", folder=tmp_path)
+    assert done.err.splitlines()[-1].endswith(
+        "run was moved or removed; cartpole-train resume=<its new place> continues it"
+    )
+    assert [*tmp_path.iterdir()] == [tmp_path / "moved"]
+    (tmp_path / "moved/config.yaml").unlink()
+    assert in_process("train", "resume=moved", folder=tmp_path).code == 0
+    assert (tmp_path / "moved/config.yaml").exists()
 
 
 def test_a_training_resumes_with_the_carts_that_it_drew(tmp_path: Path) -> None:
