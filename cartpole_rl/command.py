@@ -57,7 +57,7 @@ def run_command(name: str, verb: "Verb") -> None:
 
     The run folder is removed at the end if nothing was written to it.
     """
-    given = sys.argv[1:]
+    given = [part for word in sys.argv[1:] for part in re.split("(?<=^--cfg)=", word)]
     schema: type[Settings] = verb.find(verb.settings)
     accept_all_characters()
     catch_signals()

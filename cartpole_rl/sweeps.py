@@ -43,7 +43,7 @@ from cartpole_rl.run_folder import CONFIG, ERROR, MULTIRUN
 from cartpole_rl.settings import Settings
 from cartpole_rl.terminal import as_word, print_message, program
 
-MODES = MULTIRUN_FLAGS | {"-r", "--run", "-c", "--cfg", "-i", "--info", "-sc", "--shell-completion"}
+MODES = MULTIRUN_FLAGS | {"-r", "--run", "-i", "--info", "-sc", "--shell-completion"}
 REPORTED = ("train", "finetune", "evaluate")  # commands whose runs cartpole-report compares
 NOT_ENDED = "it was killed or interrupted, or is still running"
 
@@ -184,10 +184,10 @@ def jobs_of(config: DictConfig) -> list[list[str]]:
 def as_multirun(words: Sequence[str]) -> list[str]:
     """Return the words of a command line, with -m beside sweep=...: a choice cannot set the mode.
 
-    Hydra takes one mode, so `--cfg job` and the like stay alone.
+    Hydra takes one mode, so the others stay alone; `shown_jobs` shows the settings of each job.
     """
     chosen = any(word.startswith("sweep=") for word in words)
-    has_mode = any(word.partition("=")[0] in MODES for word in words)
+    has_mode = any(word.partition("=")[0] in MODES for word in words) or {"hydra", "all"} & {*words}
     return [*words, "--multirun"] if chosen and not has_mode else [*words]
 
 

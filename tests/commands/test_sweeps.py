@@ -47,8 +47,9 @@ def test_a_sweep_is_as_its_words_after_dash_m(tmp_path: Path) -> None:
 
     done = in_process("train", *words, folder=tmp_path, function=note)
     assert (done.code, found) == (0, 2 * [(0.96, 0.3, 3.0)]), done.err
-    shown = in_process("train", *words, "--cfg", "job", folder=tmp_path)
-    assert (shown.code, shown.out.count("horizon: 0.5")) == (0, 2), shown.err
+    for shown_words in ((*words, "--cfg", "job"), (*words[:-1], "--cfg=job")):
+        shown = in_process("train", *shown_words, folder=tmp_path)
+        assert (shown.code, shown.out.count("horizon: 0.5")) == (0, 2), shown.err
 
 
 @pytest.mark.parametrize(
