@@ -11,7 +11,7 @@ import sys
 import threading
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
@@ -65,6 +65,9 @@ def is_defect(error: Exception) -> bool:
 def one_line(error: Exception, name: str, plants: Collection[str] = ()) -> str:
     """Return what cartpole-<name> prints of an error; with its class if it is a defect."""
     if isinstance(error, OF_HYDRA):
+        if isinstance(error, OmegaConfBaseException) and (behind := error_behind(error, OSError)):
+            reason = one_line(behind, name)  # of making a run folder
+            return f"{reason}; give hydra.run.dir= or hydra.sweep.dir= another folder"
         return error_message(error, name, sys.argv[1:], plants)
     if isinstance(error, OSError) and not is_defect(error):
         remedy = "; make room" if error.errno in FULL else ""
@@ -83,9 +86,14 @@ def exit_after_signal(name: str, signalled: BaseException) -> NoReturn:
     sys.exit(SIGNALLED + number)
 
 
-def signal_behind(error: BaseException | None) -> BaseException | None:
+def signal_behind(error: BaseException) -> BaseException | None:
     """Return what a signal raised, if `error` follows from it, as the error of an interrupted import."""
-    while error is not None and not isinstance(error, KeyboardInterrupt | Terminated):
+    return error_behind(error, KeyboardInterrupt, Terminated)
+
+
+def error_behind(error: BaseException | None, *kinds: type[BaseException]) -> Any:
+    """Return the error of one of these kinds that `error` is or follows from; None without one."""
+    while error is not None and not isinstance(error, kinds):
         error = error.__cause__ or error.__context__
     return error
 

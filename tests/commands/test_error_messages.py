@@ -1,8 +1,10 @@
 """Errors of Hydra and of the operating system as one line with a remedy."""
 
 import errno
+from pathlib import Path
 
 import pytest
+from command_line import in_process
 from hydra.errors import HydraException
 from omegaconf.errors import ConfigKeyError
 
@@ -31,6 +33,19 @@ def test_a_full_disk_gets_a_remedy(number: int, monkeypatch: pytest.MonkeyPatch)
     assert one_line(OSError(number, "is full"), "train") == f"{unnamed}{remedy}"
     monkeypatch.setattr("sys.argv", ["cartpole-train", "resume=run"])  # its folder is given
     assert one_line(OSError(number, "is full"), "train") == f"{unnamed}; make room"
+
+
+@pytest.mark.parametrize("words", ["", "-m seed=0,1"])
+def test_a_folder_of_runs_that_cannot_be_made_is_named(
+    words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(command: str, label: str) -> str:
+        raise OSError(errno.EROFS, "Read-only file system", f"runs/{command}")
+
+    monkeypatch.setattr("cartpole_rl.sweeps.new_folder", refuse)
+    done = in_process("train", *words.split(), folder=tmp_path)
+    remedy = "give hydra.run.dir= or hydra.sweep.dir= another folder"
+    assert done.complaint == f"cartpole-train: runs/train: Read-only file system; {remedy}"
 
 
 def test_other_errors_keep_their_first_line() -> None:
