@@ -35,6 +35,7 @@ from tensorboard.compat.proto.summary_pb2 import (
 from tensorboard.compat.tensorflow_stub.pywrap_tensorflow import masked_crc32c
 from torch.utils.tensorboard import FileWriter, summary
 
+from cartpole_rl.errors import ConfigError
 from cartpole_rl.files import replacing
 from cartpole_rl.reporting.loggers import flatten
 from cartpole_rl.reporting.style import png
@@ -109,7 +110,12 @@ class TensorBoardLog:
     def __init__(self, folder: Path | str, purge_step: int | None = None) -> None:
         if purge_step is not None:
             cut_back(Path(folder), purge_step)
-        self._writer = FileWriter(str(folder), flush_secs=FLUSH_SECONDS)
+        try:
+            self._writer = FileWriter(str(folder), flush_secs=FLUSH_SECONDS)
+        except UnicodeEncodeError:
+            raise ConfigError(
+                f"logger=tensorboard, {folder}: this path is not UTF-8; give hydra.run.dir= another folder"
+            ) from None
 
     def __enter__(self) -> "TensorBoardLog":
         return self

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +13,7 @@ from command_line import in_process
 
 from cartpole_rl.reporting import tables
 from cartpole_rl.reporting.sweeps import read_groups
-from cartpole_rl.reporting.tables import episodes, run_rows
+from cartpole_rl.reporting.tables import episodes, run_rows, write_table
 
 Edit = Callable[[Path, Callable[[Any], object]], None]
 HEAVY = "much/12/evaluations/heavy"
@@ -91,3 +92,12 @@ def test_parquet_without_its_library_is_refused_in_one_line(
     assert done.code == 2
     assert 'format=parquet needs PyArrow: pip install "cartpole_rl[parquet]"' in done.complaint
     assert not Path("report").exists()
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+def test_a_name_that_is_not_utf_8_is_escaped(suffix: str, tmp_path: Path) -> None:
+    rows = [{"run": os.fsdecode(b"caf\xe9"), "seed": 0}]
+    if suffix == "parquet":
+        pytest.importorskip("pyarrow", reason="it is an extra")
+    write_table(lambda: rows, path := tmp_path / f"runs.{suffix}")
+    assert b"caf\\udce9" in path.read_bytes()

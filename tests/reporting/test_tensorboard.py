@@ -1,6 +1,7 @@
 """TensorBoard reads back what was logged, also after a resume."""
 
 import io
+import os
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboard.backend.event_processing.event_multiplexer import EventMultiplexer
 from tensorboard.plugins.hparams import metadata
 
+from cartpole_rl.errors import ConfigError
 from cartpole_rl.reporting.animation import gif
 from cartpole_rl.reporting.episodes import behaviour
 from cartpole_rl.reporting.tensorboard import TensorBoardLog, cut_back, scalars
@@ -29,6 +31,11 @@ def points(folder: Path, name: str) -> dict[int, float]:
     events = read(folder).Scalars(name)
     assert len({event.step for event in events}) == len(events)
     return {event.step: event.value for event in events}
+
+
+def test_a_folder_that_it_cannot_name_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="this path is not UTF-8; give "):
+        TensorBoardLog(tmp_path / os.fsdecode(b"caf\xe9"))
 
 
 def test_scalars_round_trip(tmp_path: Path) -> None:
