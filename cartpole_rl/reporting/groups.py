@@ -40,6 +40,7 @@ PROFILE_POINTS = 101
 FEWEST_PROFILED = 3  # agents
 FEWEST_BANDED = 10  # agents: the interval of fewer covers the panel
 DOT, MEAN = 4.0, 7.0  # points
+NARROWEST = 1e-2  # width of an axis of dots, of the largest value: equal values can differ by rounding
 JITTER = 0.16  # of a row
 LONGEST_LABEL = 48  # characters
 LONGEST_LINE = {"x": 42, "y": 30}  # characters of a line of an axis's label
@@ -281,6 +282,9 @@ def dot_rows(groups: Groups, measure: str, guides: Mapping[str, float]) -> Figur
         axes.axvline(value, color=MUTED, linewidth=1, linestyle=DASHES, zorder=1)
         of = "data", "axes fraction"
         style.note(axes, name, (value, 1), of, (0, 2), MUTED, ha="center", va="bottom")
+    low, high = axes.get_xlim()
+    if (lacking := NARROWEST * max(abs(low), abs(high)) - (high - low)) > 0:
+        axes.set_xlim(low - lacking / 2, high + lacking / 2)
     axes.set_ylim(height - 0.4, -0.5)
     axes.set_yticks([])
     finish(axes, colours, x=measure)
@@ -318,7 +322,7 @@ def profile_curves(
     figure, axes = panel(named)
     everything = np.concatenate(list(groups.values()))
     low, high = float(everything.min()), float(everything.max())
-    margin = 0.05 * (high - low or 1.0)
+    margin = 0.05 * max(high - low, NARROWEST * max(abs(low), abs(high))) or 1.0
     scores = np.linspace(low - margin, high + margin, PROFILE_POINTS)
     for label, values in _grey_first(groups, colours):
         share, lower, upper = performance_profile(values, scores)

@@ -155,7 +155,7 @@ def _mark_times(axes: Axes, lag: Array, errors: Array, times: Sequence[float], u
     rms = np.maximum(root_mean_square(errors), SMALLEST)
     for time in times:
         index = int(np.abs(lag - time).argmin())
-        if abs(lag[index] - time) > 1e-6 or not np.isfinite(rms[index]):
+        if abs(lag[index] - time) > lag[1] / 2 or not np.isfinite(rms[index]):
             continue
         place, last = (float(lag[index]), float(rms[index])), time > 0.8 * lag[-1]
         axes.plot(*place, "o", color=colours.INK, markersize=5, clip_on=False, zorder=3)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from cartpole_rl.reporting.groups import drawings, palette, profile_curves, training_curves
+from cartpole_rl.reporting.groups import dot_rows, drawings, palette, profile_curves, training_curves
 from cartpole_rl.reporting.results import Agent, Group, Results, low_is_good
 from cartpole_rl.reporting.runs_page import figure_parts
 
@@ -71,3 +71,9 @@ def test_of_many_groups_none_is_hidden_and_two_are_coloured() -> None:
     (legend,) = profile.figure.legends
     assert {text.get_text() for text in legend.get_texts()} == {"arm 11", "arm 0"}
     assert "the grey lines are the others" in profile.caption
+
+
+def test_values_that_are_equal_but_for_rounding_have_a_legible_axis() -> None:
+    (axes,) = dot_rows({"a": {"": np.array([4104.2, 4104.2 + 1e-9])}}, "score", {}).axes
+    low, high = axes.get_xlim()
+    assert low < 4090 < 4110 < high

@@ -6,11 +6,17 @@ import numpy as np
 import pytest
 import torch
 from figure_contents import line_of
+from matplotlib.figure import Figure
 
 from cartpole_rl.drawing import colours
 from cartpole_rl.identification.prediction import Prediction
 from cartpole_rl.physics.residual import PLACES, Residual
-from cartpole_rl.reporting.predictions import ensemble_figure, error_table, forces_along_track
+from cartpole_rl.reporting.predictions import (
+    _mark_times,
+    ensemble_figure,
+    error_table,
+    forces_along_track,
+)
 
 ERRORS = {"rms_x_mm": 1.234, "median_x_mm": 1.0, "rms_theta_deg": 0.5, "median_theta_deg": 0.25}
 
@@ -26,6 +32,12 @@ def test_a_replay_has_a_row_for_each_time() -> None:
         ["0.1", "1.23", "1.00", "0.500", "0.250"],
         ["1", "1.23", "1.00", "0.500", "0.250"],
     ]
+
+
+def test_a_time_between_two_periods_is_marked_at_the_nearest() -> None:
+    axes, lag = Figure().subplots(), 0.03 * np.arange(20)
+    _mark_times(axes, lag, np.ones((20, 1)), (0.1, 0.5, 1.0), "mm")
+    assert [text.xy[0] for text in axes.texts] == pytest.approx([0.09, 0.51])
 
 
 def test_forces_are_known_where_the_cart_was() -> None:
