@@ -17,7 +17,6 @@ from matplotlib.ticker import MaxNLocator
 from cartpole_rl.drawing.colours import FAINT, INK, MUTED
 from cartpole_rl.reporting import style
 from cartpole_rl.reporting.results import (
-    GOOD,
     OWN,
     Named,
     Results,
@@ -83,7 +82,7 @@ def dots(results: Results) -> Drawing:
         for group in results.groups
     }
     shown, note = most(groups)
-    good, label = GOOD.get(measure), measure_label(measure)
+    good, label = results.good, measure_label(measure)
     values = [value for agent in results.agents for value in agent.values.values()]
     guided = good is not None and min(values) < good < max(values)
     figure = dot_rows(shown, label, {f"good: {good:g}": good} if good and guided else {})

@@ -17,6 +17,7 @@ from cartpole_rl.reporting.statistics import Array, Estimate, estimate
 from cartpole_rl.reporting.texts import MOST_DECIMALS, count_text, interval_text, number_text
 from cartpole_rl.tasks.settings import Measure
 
+THESIS_PERIODS = 500  # of an episode of 10 s, 20 ms each
 GOOD = {"score": 2000.0}  # measure: value above which the thesis calls an agent good (section 6)
 MEASURES = {  # key of metrics.json: label
     **texts.SCORES,
@@ -108,6 +109,13 @@ class Results:
     evaluations: Sequence[Named] = (OWN,)
     unit: str = "agent"  # what a run makes
     pictured: bool = False  # the results of the runs are figures
+    periods: int | None = THESIS_PERIODS  # control periods of the episodes of 10 s; None: not all are such
+
+    @property
+    def good(self) -> float | None:
+        """The value above which an agent is good: a score is a sum over `periods`."""
+        good = GOOD.get(self.measure)
+        return None if good is None or self.periods is None else good * self.periods / THESIS_PERIODS
 
     @property
     def judged(self) -> Sequence[Named]:

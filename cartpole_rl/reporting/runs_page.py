@@ -14,7 +14,6 @@ from PIL import Image
 from cartpole_rl.reporting.animation import smaller
 from cartpole_rl.reporting.groups import Drawing, drawings
 from cartpole_rl.reporting.results import (
-    GOOD,
     Agent,
     Results,
     estimate_text,
@@ -223,7 +222,7 @@ def _value_rows(results: Results) -> list[dict[str, Any]]:
                 "lowest": value_text(float(values.min()), measure),
                 "highest": value_text(float(values.max()), measure),
             }
-            if good := GOOD.get(measure):
+            if good := results.good:
                 row[f"above {good:g}"] = f"{(values > good).sum()} of {values.size}"
             rows.append({**row, f"{results.unit}s": values.size})
     return rows

@@ -1,5 +1,6 @@
 """Reads any set of runs, groups them by the settings that differ, and compares two sets."""
 
+import math
 import os
 import re
 from collections import Counter
@@ -14,7 +15,17 @@ from typing import Any
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.reporting.grouping import AGENT, NULL, SOURCE, Columns, fewest, labels, setting_columns
 from cartpole_rl.reporting.groups import LONGEST_LABEL, MOST_LINES
-from cartpole_rl.reporting.results import OWN, Agent, Curve, Exclusion, Group, Results, seeds_text
+from cartpole_rl.reporting.results import (
+    OWN,
+    THESIS_PERIODS,
+    Agent,
+    Curve,
+    Exclusion,
+    Group,
+    Results,
+    is_number,
+    seeds_text,
+)
 from cartpole_rl.reporting.runs import (
     EPISODIC,
     Run,
@@ -43,6 +54,7 @@ from cartpole_rl.run_folder import (
     is_own_policy,
 )
 
+SECONDS = 10.0  # of an episode of the thesis
 MOST_MEASURES = 20  # in a message
 MOST_UNSORTED = 12  # groups that are shown in the order of their runs
 STAGES = ("before", "after")  # of a fine-tuning
@@ -302,7 +314,21 @@ def results_of(sweep: Sweep, measure: str) -> Results:
         tuple(note for note in notes if note),
         sweep.members[0].run.versions if sweep.members else "",
         [OWN if name == OWN.name else Group(name, name) for name in evaluations] or [OWN],
+        periods=_periods(sweep.members),
     )
+
+
+def _periods(members: Sequence[Member]) -> int | None:
+    """Return the control periods of the episodes, where all of them last as long as the thesis's."""
+    found = set()
+    for member in members:
+        settings = member.run.config.get("evaluated") or (member.agent or member.run).config
+        task, period = settings.get("task"), settings.get("control_period")
+        if isinstance(task, Mapping) and is_number(period) and period > 0:  # else the usual ones
+            limit = task.get("time_limit")
+            periods = limit if is_number(limit) else (task.get("duration") or 0) / period
+            found.add(round(periods) if math.isclose(periods * period, SECONDS, rel_tol=0.01) else None)
+    return found.pop() if len(found) == 1 else None if found else THESIS_PERIODS
 
 
 def _agents(kept: Sequence[Kept], measure: str, curves: Mapping[Path, Mapping[str, Curve]]) -> list[Agent]:

@@ -13,7 +13,7 @@ from cartpole_rl.reporting.sweeps import STAGES, Sweep, read_groups, without_rep
 from cartpole_rl.run_folder import COMPARISON, METRICS
 
 STAGE_SCORES = {f"score_{stage}": f"{Path(COMPARISON).stem}.{stage}.score" for stage in STAGES}
-ENCODING = {"encoding": "utf-8", "errors": "backslashreplace"}  # a file's name may hold bytes that are none
+ESCAPED = "backslashreplace"  # a file's name may hold bytes that are no UTF-8
 BATCH = 10_000  # rows of a Parquet file that are in memory at once
 
 Row = Mapping[str, Hashable]
@@ -115,7 +115,7 @@ def _kinds(rows: Iterable[Row]) -> dict[str, type]:
 
 
 def _write_csv(rows: Iterable[Row], kinds: Mapping[str, type], path: Path) -> None:
-    with replacing(path) as part, part.open("w", newline="", **ENCODING) as file:
+    with replacing(path) as part, part.open("w", -1, "utf-8", ESCAPED, "") as file:
         writer = csv.DictWriter(file, [*kinds], restval="", lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
@@ -135,4 +135,4 @@ def _write_parquet(rows: Iterable[Row], kinds: Mapping[str, type], path: Path) -
 
 
 def _cell(value: Hashable, kind: type) -> Hashable:
-    return str(value).encode(**ENCODING).decode() if kind is str and value is not None else value
+    return str(value).encode(errors=ESCAPED).decode() if kind is str and value is not None else value

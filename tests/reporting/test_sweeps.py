@@ -55,6 +55,16 @@ def test_runs_are_grouped_by_the_settings_that_differ(study: Path) -> None:
     assert of_study["quick/friction/much/11/evaluations/heavy"] == metrics[MEASURE]["mean"]
 
 
+@pytest.mark.parametrize(("period", "seconds", "good"), [(0.02, 10, 2000), (0.01, 10, 4000), (0.02, 5, None)])
+def test_a_good_score_is_that_of_so_many_periods(
+    period: float, seconds: float, good: float | None, study: Path
+) -> None:
+    (sweep,), _ = read_groups({"runs": ["quick/friction"]}, "score")
+    config = {"evaluated": {"control_period": period, "task": {"time_limit": round(seconds / period)}}}
+    members = [replace(member, run=replace(member.run, config=config)) for member in sweep.members]
+    assert results_of(replace(sweep, members=members), "score").good == good
+
+
 def test_patterns_and_lists_name_runs(study: Path) -> None:
     one = read_sweep("quick/*/much/*/evaluations/heavy")
     two = read_sweep("quick/friction/much/10", "quick/friction/much/11", "quick/friction/much/10")
