@@ -5,6 +5,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from glob import glob
@@ -23,10 +24,10 @@ from cartpole_rl.reporting.results import (
     Exclusion,
     Group,
     Results,
-    is_number,
     seeds_text,
 )
 from cartpole_rl.reporting.runs import (
+    DAMAGE,
     EPISODIC,
     Run,
     commits_note,
@@ -320,14 +321,13 @@ def results_of(sweep: Sweep, measure: str) -> Results:
 
 def _periods(members: Sequence[Member]) -> int | None:
     """Return the control periods of the episodes, where all of them last as long as the thesis's."""
-    found = set()
+    found: set[int | None] = set()
     for member in members:
-        settings = member.run.config.get("evaluated") or (member.agent or member.run).config
-        task, period = settings.get("task"), settings.get("control_period")
-        if isinstance(task, Mapping) and is_number(period) and period > 0:  # else the usual ones
-            limit = task.get("time_limit")
-            periods = limit if is_number(limit) else (task.get("duration") or 0) / period
-            found.add(round(periods) if math.isclose(periods * period, SECONDS, rel_tol=0.01) else None)
+        with suppress(*DAMAGE):  # a run without them, as many a fine-tuning, has the usual ones
+            settings: Any = member.run.config.get("evaluated") or (member.agent or member.run).config
+            task, period = settings["task"], settings["control_period"]
+            limit = task.get("time_limit") or task["duration"] / period
+            found.add(round(limit) if math.isclose(limit * period, SECONDS, rel_tol=0.01) else None)
     return found.pop() if len(found) == 1 else None if found else THESIS_PERIODS
 
 
