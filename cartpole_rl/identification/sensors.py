@@ -302,8 +302,8 @@ def delay_estimate(
 
     first, last = -float(EARLIEST), max(LATEST, LONGEST_DELAY / period)
     shifts = np.arange(-FURTHEST, FURTHEST + 1)
-    shift = int(shifts[unexplained([samples.push(each) for each in shifts]).argmin()])
-    if not first <= shift <= last:
+    shift = int(shifts[unexplained([samples.push(float(each)) for each in shifts]).argmin()])
+    if shifted := not first <= shift <= last:
         first, last = shift - 1, shift + 1.0
     delays = np.arange(first, last + 0.01, max(0.25, FINEST / period))
     pushes, delays = [samples.push(each) for each in delays], period * delays
@@ -313,7 +313,8 @@ def delay_estimate(
         return _lowest(delays, unexplained(pushes, weights))
 
     found = _estimate(best(None), [best(_weights(samples.piece, dice)) for _ in range(SAMPLES)])
-    return found if delays[0] < found.value < delays[-1] else None
+    sure = not shifted or found.high - found.low < period
+    return found if sure and delays[0] < found.value < delays[-1] else None
 
 
 def _regression(terms: Array, values: Array, weights: Array | None) -> tuple[Array, Array]:
