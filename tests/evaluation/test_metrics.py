@@ -1,6 +1,7 @@
 """Metrics of hand-made episodes, and the coverage of the intervals."""
 
 import math
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -95,6 +96,18 @@ def test_an_interval_is_the_same_each_time_and_narrows_with_more_values() -> Non
     assert interval(values) == interval(values)
     few, many = interval(values[:20]), interval(values)
     assert many[1] - many[0] < 0.5 * (few[1] - few[0])
+
+
+def test_an_interval_of_many_values_needs_little_memory() -> None:
+    values = np.random.default_rng(2).exponential(2.0, 6000)
+    tracemalloc.start()
+    try:
+        low, high = interval(values)
+        _, most = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert low < values.mean() < high
+    assert most < 300e6  # bytes
 
 
 def test_the_summary_counts_endings_and_skips_missing_metrics() -> None:
