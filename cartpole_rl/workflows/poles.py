@@ -148,11 +148,10 @@ def recorded_pole(
         if recordings[0].episode.encoders != nominal_encoders():
             raise ConfigError("pole: the recordings do not say which one it is; give the pole of this cart")
         return next(iter(known.items()))
-    if len(lengths) > 1:
-        several = ", ".join(f"{length:g}" for length in lengths)
-        raise ConfigError(f"pole: poles of {several} m were recorded; replay those of one pole at a time")
-    (length,) = lengths
     for name, pole in known.items():
-        if pole.is_about(length):
+        if all(map(pole.is_about, lengths)):
             return name, pole
-    raise ConfigError(f"pole: one of {length:g} m was recorded; give one of {', '.join(POLES)}, or your own")
+    several = ", ".join(f"{length:g}" for length in lengths)
+    if len(lengths) > 1:
+        raise ConfigError(f"pole: poles of {several} m were recorded; replay those of one pole at a time")
+    raise ConfigError(f"pole: one of {several} m was recorded; give one of {', '.join(POLES)}, or your own")

@@ -56,7 +56,7 @@ def agents_settings(evaluation: Evaluation) -> CartPoleSettings:
 def heading(config: EvaluateConfig, settings: CartPoleSettings, episode: Episode) -> dict[str, Any]:
     """Return the heading of a recording: the run, and the simulated cart with its initial state."""
     origin = stored_origin(episode.origin) if episode.origin else {}
-    length = config.plant.known_pole_length(config.emulator)  # stated for a real cart
+    length = episode.pole_length or config.plant.known_pole_length(config.emulator)  # stated for a real cart
     if length is None and settings.pole.is_single:
         length = settings.pole.nominal.length
     return {

@@ -1,5 +1,6 @@
 """cartpole-record on every kind of cart and when it is interrupted, and run=lqr."""
 
+import json
 import math
 from pathlib import Path
 
@@ -32,6 +33,15 @@ def test_every_episode_of_an_agent_is_a_file(trained: Path, tmp_path: Path) -> N
     config = yaml.safe_load((tmp_path / "run/config.yaml").read_text())
     assert config["recorded"]["task"]["time_limit"] == 60
     assert (tmp_path / "run/provenance.json").exists()
+
+
+def test_the_length_of_a_drawn_pole_is_that_of_its_cart(trained: Path, tmp_path: Path) -> None:
+    words = (f"run={trained}", "pole=range", "episodes=2", "hydra.run.dir=run")
+    assert in_process("record", *words, folder=tmp_path).code == 0
+    recordings = [*map(read_recording, sorted((tmp_path / "run/recordings").iterdir()))]
+    lengths = [2 * json.loads(each.facts["cart"])["pole_com"] for each in recordings]
+    assert [each.pole_length for each in recordings] == pytest.approx(lengths, abs=1e-4)
+    assert lengths[0] != lengths[1]
 
 
 def test_the_baseline_drives_the_emulated_cart_with_its_own_pole(tmp_path: Path) -> None:

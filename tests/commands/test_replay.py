@@ -126,6 +126,14 @@ def test_the_recorded_poles_are_one_that_is_known(
     assert done.code in (1, 2)
 
 
+def test_lengths_of_one_pole_may_differ_a_little(recorded: Path, tmp_path: Path) -> None:
+    text = (recorded / "recordings/episode_000.csv").read_text()
+    for length in ("0.3500", "0.3600"):
+        (tmp_path / f"{length}.csv").write_text(text.replace("length_m: 0.3556", f"length_m: {length}"))
+    done = in_process("replay", "from=.", folder=tmp_path)
+    assert "2 episodes, pole=medium" in done.out
+
+
 def test_too_short_a_recording_says_so(recorded: Path, tmp_path: Path) -> None:
     lines = (recorded / "recordings/episode_000.csv").read_text().splitlines()
     heading = sum(line.startswith("#") for line in lines)
