@@ -65,7 +65,7 @@ class OwnPolicy:
 
     def _result(self, observation: Tensor) -> Tensor:
         try:
-            given = torch.as_tensor(self._function(observation.clone()))
+            given = torch.as_tensor(self._function(observation.clone())).cpu()
             if given.dtype in UNSIGNED:
                 given = given.long()
             elif given.is_floating_point() and given.itemsize == 1:

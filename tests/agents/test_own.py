@@ -33,6 +33,9 @@ def mask(observation):
 def complex_values(observation):
     return torch.zeros(2, 3, dtype=torch.complex64)
 
+def on_another_device(observation):
+    return torch.zeros(2, 3, device="meta")
+
 def unsigned(observation):
     return observation.argmax(-1).to(torch.uint16)
 
@@ -99,6 +102,7 @@ def test_what_is_not_finite_is_motor_value_0(name: str) -> None:
         ("half", "it chose 0.5; give integers from 0 to 2"),
         ("flat", r"shape \[5\] for observations \[2, 2\]; give actions \[2\] or action values \[2, 3\]"),
         ("complex_values", "it gave complex numbers; give real ones"),
+        ("on_another_device", "NotImplementedError: Cannot copy out of meta tensor"),
         ("fails", r"RuntimeError: no weights \(.*own_policies.py, line [34]\d\)"),
         ("Driver", "it is a class; give a function"),
         ("none", "has no 'none'"),
