@@ -277,7 +277,7 @@ def test_a_training_ends_where_its_folder_was_moved_and_continues_there(
         run.rename(tmp_path / "moved")
 
     with monkeypatch.context() as patch:
-        patch.setattr("cartpole_rl.workflows.monitor.save_training", moving)
+        patch.setattr("cartpole_rl.workflows.train.save_training", moving)
         done = in_process("train", *TINY, "hydra.run.dir=run", folder=tmp_path)
     assert done.err.splitlines()[-1].endswith(
         "run was moved or removed; cartpole-train resume=<its new place> continues it"
