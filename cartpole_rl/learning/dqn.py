@@ -34,7 +34,7 @@ COLLECTED: tuple[NestedKey, ...] = ("observation", "action", "guard", *NEXT, ("n
 LEARNED: tuple[NestedKey, ...] = ("observation", "action", "steps_to_next_obs", *NEXT)
 OPTIMIZERS = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW}
 LARGEST_ERROR = 1e30  # squared: priorities of 32 bits, and their sum over any buffer, are then finite
-FEW_EPISODES = 1.5  # of each cart in a full buffer
+FEW_EPISODES = 2.5  # of each cart in a full buffer
 Scalars = dict[str, float]
 
 

@@ -505,7 +505,7 @@ def test_seconds_give_the_same_learning_at_any_control_period() -> None:
     assert reward.model_copy(update={"period": None}).at(0.01).scale == 0.05
 
 
-@pytest.mark.parametrize(("size", "spread"), [(16 * 30, True), (16 * 60, False)])
+@pytest.mark.parametrize(("size", "spread"), [(16 * 60, True), (16 * 80, False)])
 def test_with_a_short_buffer_the_episodes_end_one_after_the_other(
     size: int, spread: bool, make_training: MakeTraining
 ) -> None:
