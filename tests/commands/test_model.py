@@ -88,7 +88,8 @@ def test_its_errors_are_written_and_printed(learned: tuple[Path, Outcome]) -> No
     assert (folder / "figures/model.png").stat().st_size > 10_000
     config = yaml.safe_load((folder / "config.yaml").read_text())
     second = Path(config["from"][1])  # maybe the copy of another worker
-    assert second.is_file() and second.is_absolute()
+    assert second.is_file()
+    assert second.is_absolute()
     assert second.parts[-2:] == ("recordings", "episode_001.csv")
     assert config["ensemble"]["members"] == 2
 
