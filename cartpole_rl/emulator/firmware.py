@@ -257,12 +257,9 @@ class Firmware:
 
     def _apply_limits(self, now_us: int) -> None:
         """Let the limits decide about the requested motor value, by the counts that were read last."""
-        outward, angle, half_span = (
-            self._cart - self._zeros.middle,
-            self._pole - self._pole_zero,
-            self._zeros.half_span,
-        )
-        self._limits.apply(now_us, outward, angle, half_span, self.armed, self._pressed, self._line.requested)
+        outward, angle = self._cart - self._zeros.middle, self._pole - self._pole_zero
+        half_span, motor = self._zeros.half_span, self._line.requested
+        self._limits.apply(now_us, outward, angle, half_span, self.armed, self._pressed, motor)
 
     def _obey(self, envelope: Envelope, now_us: int) -> Message | Reason | None:
         """Carry out a frame and return the answer; None for SET_MOTOR, which the next STATE acknowledges."""

@@ -3,9 +3,9 @@
 Faults are a stalled cart and implausible encoders, looked for at the end of each period. The limits know the
 cart's position and speed; they are looked at once a millisecond.
 
-Beyond the soft limit an outward motor value gives 0. So it does where looks are rare, if it would make the
-cart too fast to be stopped from the next look on. A cart that runs outward too fast to stop before its hard
-limit is braked with full motor inward:
+Beyond the soft limit an outward motor value gives 0. Where looks are rare, it also gives 0 if it would make
+the cart too fast to be stopped from the next look on. A cart that runs outward too fast to stop before its
+hard limit is braked with full motor inward:
 
     left - shake < speed * (lag + reaction) + speed^2 / (2 * braking)
 
@@ -32,10 +32,9 @@ import math
 from collections import deque
 from collections.abc import Mapping
 
-from cartpole_rl.rig.hardware import Hardware
+from cartpole_rl.rig.hardware import LARGEST_MOTOR, Hardware
 
 LEFT, RIGHT = 1, 2  # bits of end switches
-LARGEST = 255  # motor value
 SHORTEST_US, LONGEST_US = 5_000, 100_000  # control periods
 STALL_US = 500_000
 STALL_UM = 1000
@@ -306,7 +305,7 @@ class TrackLimits:
             self.blocked = 1 if outward > 0 else -1
         elif armed and motor and self._look_us and self._us:
             side, since_us = 1 if motor > 0 else -1, self._look_us + (self._us[-1] - self._us[0]) // 2
-            push = 3 * self._braking * abs(motor) // (2 * LARGEST)  # um/s^2; `braking` is a third less
+            push = 3 * self._braking * abs(motor) // (2 * LARGEST_MOTOR)  # um/s^2; `braking` is a third less
             reached = max(0, side * speed + push * since_us // 1_000_000)
             if self._passes(side, side * reached, outward, pole, half_span, pressed):
                 self.blocked = side

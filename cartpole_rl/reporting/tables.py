@@ -115,7 +115,7 @@ def _kinds(rows: Iterable[Row]) -> dict[str, type]:
 
 
 def _write_csv(rows: Iterable[Row], kinds: Mapping[str, type], path: Path) -> None:
-    with replacing(path) as part, part.open("w", -1, "utf-8", ESCAPED, "") as file:
+    with replacing(path) as part, part.open("w", encoding="utf-8", errors=ESCAPED, newline="") as file:
         writer = csv.DictWriter(file, [*kinds], restval="", lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)

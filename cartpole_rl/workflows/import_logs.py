@@ -170,7 +170,9 @@ def doubts(reports: Sequence[Report], sensors: Sensors, period: float, layout: L
             "the pole falls upwards: layout.angle.upright is half a turn off; give the recorded angle of the "
             "upright pole"
         )
-    shifted = [*_delay_doubts(sensors, period, layout)]  # which also shows as a motor of the other sign
+    stale = max(each.stale for each in reports) > STALE
+    # a shift also shows as a motor of the other sign
+    shifted = [] if stale else [*_delay_doubts(sensors, period, layout)]
     if sensors.push < -CORRELATED and sensors.lag < -CORRELATED:
         yield (
             "positive motor values accelerate the cart to the left, and the pole runs ahead of its cart: "
@@ -203,7 +205,6 @@ def doubts(reports: Sequence[Report], sensors: Sensors, period: float, layout: L
             f"the cart would be faster than {FASTEST_CART:g} m/s in {jumps} of {rows} rows: its counter "
             "begins anew there, or layout.position.unit is wrong"
         )
-    stale = max(each.stale for each in reports) > STALE
     if stale:
         yield (
             "rows are written more often than the cart is measured, so states stand still between rows: give "

@@ -26,9 +26,7 @@ def check_cart(config: PreflightConfig) -> None:
     finding: Finding | None = None
     with (
         plant.reachable(config.emulator.of_cart(config.cart), hardware) as (settings, server),
-        closing(
-            SerialCart(settings, hardware, asked, server)
-        ) as cart,  # it is disarmed and closed at the end
+        closing(SerialCart(settings, hardware, asked, server)) as cart,  # disarmed and closed at the end
     ):
         for finding in preflight(cart, faults):
             print(finding, flush=True)

@@ -42,8 +42,7 @@ class SerialLink:
     def __init__(
         self, port: serial.SerialBase, statistics: LinkStatistics, server: "CartProcess | None" = None
     ) -> None:
-        self._port = port
-        self._board, self._why_ended = (server.board, server.death) if server else ("", str)
+        self._port, self._server = port, server
         self._splitter = FrameSplitter()
         self.statistics = statistics
         self.sequence = os.urandom(1)[0]  # of the newest frame sent; unlike that of the last host
@@ -55,7 +54,7 @@ class SerialLink:
     @property
     def port(self) -> str:
         """Path or URL of the port, as a person knows it: of a bridge, that of its board."""
-        return self._board or str(self._port.port)
+        return (self._server.board if self._server else "") or str(self._port.port)
 
     def send(self, *messages: Message) -> int:
         """Write the messages in one go and return the sequence of the last. Raises LinkError."""
@@ -140,6 +139,6 @@ class SerialLink:
     def _broken(self, what: str, error: OSError) -> LinkError:
         """Return an error with the reason of the server, if it has ended."""
         return LinkError(
-            self._why_ended()
+            (self._server.death() if self._server else "")
             or f"{self.port} cannot be {what} any more: {error}; is the cart unplugged or without power?"
         )
