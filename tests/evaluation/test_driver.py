@@ -129,5 +129,6 @@ def test_a_process_that_is_killed_while_it_sends_an_episode_has_died() -> None:
         driving.start(EpisodeRequest(as_weights(network()), 0.0, 0))
         wait_for(lambda: unread(driving) > HEADER)
         os.kill(driving.pid, signal.SIGKILL)
+        driving._process.join()  # else its write goes on for as long as this process reads
         with pytest.raises(LinkError, match="has died"):
             driving.result()
