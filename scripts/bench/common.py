@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 import numpy as np
 import yaml
 
+from cartpole_rl.files import write_text
 from cartpole_rl.reporting.texts import Cell, table
 from cartpole_rl.workflows.build import use_threads
 
@@ -150,4 +151,4 @@ def write_json(file: Path | None, content: Any) -> None:
         text = re.sub(
             r"\[[^\[\]{}\"]+\]", lambda numbers: " ".join(numbers[0].split()), json.dumps(content, indent=1)
         )
-        file.write_text(text + "\n")
+        write_text(file, text + "\n")
