@@ -1,12 +1,16 @@
 """A compiled or traced function gives the results and the types of the plain one."""
 
 import shutil
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
+from torch import Tensor
 
+from cartpole_rl.arithmetic.writer import Scalar
 from cartpole_rl.compilation import Compiled, Traced, acting_with, as_byte
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.exits import Terminated
@@ -50,13 +54,35 @@ def test_it_computes_the_same_in_every_call(kind: type[Compiled[Moved]] | type[T
             torch.testing.assert_close(value, right)
 
 
-@pytest.mark.parametrize("kind", [Compiled, Traced])
-def test_a_branch_on_a_number_is_refused_by_its_line(kind: type[Compiled] | type[Traced]) -> None:
-    def braked(speed: tuple[torch.Tensor]) -> tuple[torch.Tensor]:
-        return (-speed[0] if (speed[0] > 0.3).any() else speed[0],)
+@pytest.mark.parametrize("kind", [Compiled, Traced, Scalar])
+@pytest.mark.parametrize(
+    "is_fast",
+    [
+        lambda speed: (speed > 0.3).any(),
+        lambda speed: speed.tolist()[0] > 0.3,
+        lambda speed: max(np.abs(speed)),
+    ],
+    ids=["branch", "list", "NumPy"],
+)
+def test_a_branch_on_a_number_is_refused_by_its_line(kind: Any, is_fast: Callable[[Tensor], Any]) -> None:
+    def braked(speed: tuple[Tensor]) -> tuple[Tensor]:
+        return (-speed[0] if is_fast(speed[0]) else speed[0],)
 
     with pytest.raises(ConfigError, match=r"test_compilation\.py, line \d+: a formula cannot branch"):
-        kind(braked)((torch.rand(7),))
+        kind(braked, (torch.rand(7),)) if kind is Scalar else kind(braked)((torch.rand(7),))
+
+
+@pytest.mark.parametrize("kind", [Compiled, Traced])
+def test_a_constant_is_kept_and_its_number_may_be_read(kind: type[Compiled] | type[Traced]) -> None:
+    limits = torch.tensor([1.0, 2.0])
+
+    def limited(speed: tuple[Tensor]) -> tuple[Tensor]:
+        most = limits.sum() if limits[1] * 2 > 3 else limits[0]
+        return (speed[0].clamp(max=most.item()) + torch.tensor(1.0).add_(speed[0].min()),)
+
+    compiled = kind(limited)
+    for _ in range(2):
+        assert compiled((torch.tensor([0.5, 9.0]),))[0].tolist() == [2.0, 4.5]
 
 
 def test_no_gradient_flows_through_it() -> None:

@@ -23,10 +23,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 from torch._ops import OpOverload
-from torch.fx import GraphModule, Node
+from torch.fx import Node
 
 from cartpole_rl.arithmetic.languages import FUNCTIONS, PYTHON, Line, Operand, Python
-from cartpole_rl.compilation import trace
+from cartpole_rl.compilation import Trace, trace
 
 Expressions = NDArray[np.object_]  # numbers, and names of variables
 LARGEST_FLOAT = torch.finfo(torch.float32).max
@@ -51,15 +51,15 @@ class Writer:
         self._kinds |= dict.fromkeys(names, kind_of(example.dtype))
         return np.array(names, dtype=object).reshape(tuple(example.shape))
 
-    def write(self, graph: GraphModule, inputs: Sequence[Expressions]) -> list[Expressions]:
-        """Return the outputs of `graph`, after writing the lines that compute them."""
+    def write(self, traced: Trace, inputs: Sequence[Expressions]) -> list[Expressions]:
+        """Return the outputs of a graph, after writing the lines that compute them."""
         values: dict[Node, Any] = {}
         unread = iter(inputs)
-        for node in graph.graph.nodes:
+        for node in traced.graph.nodes:
             if node.op == "placeholder":
                 values[node] = next(unread)
             elif node.op == "get_attr":
-                values[node] = np.asarray(getattr(graph, node.target).numpy(), dtype=object)
+                values[node] = np.asarray(traced.constants[node.target].numpy(), dtype=object)
             elif node.op == "output":
                 return [values[each] for each in node.args[0]]
             else:
@@ -90,13 +90,10 @@ class Writer:
         name = node.target._schema.name.removeprefix("aten::")
         if name in SHAPES:
             return SHAPES[name](*arguments, **named)
-        example = node.meta["val"]
         try:
-            if not isinstance(example, torch.Tensor):  # several results
-                raise KeyError(name)
-            kind = kind_of(example.dtype)
+            kind = kind_of(node.meta["dtype"])  # or KeyError: it has several results
             if name in FILLED:
-                return np.full(tuple(example.shape), kind(FILLED[name]), dtype=object)
+                return np.full(node.meta["shape"], kind(FILLED[name]), dtype=object)
             return self._each(*operation_of(name, arguments, named, kind), kind)
         except KeyError:
             raise NotImplementedError(
@@ -193,10 +190,9 @@ class Scalar:
     """
 
     def __init__(self, function: Callable[..., tuple[Tensor, ...]], *examples: tuple[Tensor, ...]) -> None:
-        with torch.no_grad():
-            traced = trace(function, examples, mode="fake")
+        traced = trace(function, examples)
         self._result = traced.result
-        self._compute = compiled(traced.graph, examples)
+        self._compute = compiled(traced, examples)
 
     def __call__(self, *arguments: Sequence[Sequence[float]]) -> Any:
         """Return the function's result."""
@@ -208,14 +204,14 @@ def plain(tensor: Tensor) -> tuple[Any, ...]:
     return tuple(tensor.reshape(-1).tolist())
 
 
-def compiled(graph: torch.fx.GraphModule, examples: Sequence[tuple[Tensor, ...]]) -> Callable[..., Any]:
-    """Return the Python function that computes the outputs of `graph`."""
+def compiled(traced: Trace, examples: Sequence[tuple[Tensor, ...]]) -> Callable[..., Any]:
+    """Return the Python function that computes the outputs of a graph."""
     writer = Writer(PYTHON)
     inputs = [
         [writer.variables(f"i{row}_{part}_{{0}}", tensor) for part, tensor in enumerate(example)]
         for row, example in enumerate(examples)
     ]
-    outputs = writer.write(graph, [each for example in inputs for each in example])
+    outputs = writer.write(traced, [each for example in inputs for each in example])
     names = [f"argument_{row}" for row in range(len(inputs))]
     lines = [
         *(f"({''.join(map(display, parts))}) = {name}" for name, parts in zip(names, inputs, strict=True)),

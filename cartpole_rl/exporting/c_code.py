@@ -51,7 +51,7 @@ def body(graph: Graph) -> str:
     """Return the statements of a function that perceives."""
     writer = Writer(C99)
     named = {name: writer.variables(f"{name}_{{0}}", example) for name, example in graph.inputs.items()}
-    results = writer.write(graph.trace.graph, list(named.values()))
+    results = writer.write(graph.trace, list(named.values()))
     percept = graph.trace.result(results)
 
     def in_c(value: Any, kind: type) -> str:

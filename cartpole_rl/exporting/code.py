@@ -37,9 +37,10 @@ class Graph(NamedTuple):
     @classmethod
     def of(cls, function: Callable[..., tuple[Tensor, ...]], *examples: Any) -> "Graph":
         """Trace a `function` of named tuples of tensors."""
-        with torch.no_grad():
-            traced = trace(function, examples, mode="fake")
-        return cls(traced, {name: part for example in examples for name, part in example._asdict().items()})
+        return cls(
+            trace(function, examples),
+            {name: part for example in examples for name, part in example._asdict().items()},
+        )
 
 
 class First(NamedTuple):

@@ -126,7 +126,7 @@ def function(name: str, graph: Graph) -> str:
     """Return a graph as a function of arrays of numbers, in the order of its inputs, that returns arrays."""
     writer = Writer(JAVASCRIPT)
     variables = [writer.variables(f"{each}[{{0}}]", example) for each, example in graph.inputs.items()]
-    results = writer.write(graph.trace.graph, variables)
+    results = writer.write(graph.trace, variables)
     parts = [
         f"{key}: [{', '.join(map(JAVASCRIPT.text, values.reshape(-1)))}]"
         for key, values in graph.trace.result(results)._asdict().items()

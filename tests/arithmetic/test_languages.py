@@ -87,7 +87,7 @@ def in_c(number: int) -> str:
     """Return an operation as a C function."""
     graph, writer = operation(number, torch.float32), Writer(C99)
     inputs = [writer.variables(name, example) for name, example in graph.inputs.items()]
-    results = writer.write(graph.trace.graph, inputs)
+    results = writer.write(graph.trace, inputs)
     lines = "".join(f"    {line}\n" for line in writer.statements(results))
     (result,) = results[0].reshape(-1)
     unused = "    (void)a;\n    (void)b;\n"
