@@ -5,6 +5,7 @@ cart in any case. Nothing is locked. A counter that is odd during a write lets t
 """
 
 import multiprocessing
+import os
 import struct
 import time
 from collections.abc import Iterable
@@ -18,7 +19,8 @@ if TYPE_CHECKING:
 
 COUNTER = struct.Struct("<Q")
 FIELDS = struct.Struct("<2I 2i 2Q 7d")  # a jump of the cart's tick can add 2^32 lost frames at once
-SIZE = COUNTER.size + FIELDS.size
+DRIVER = struct.Struct("<I")  # behind the fields: the id of the process that drives, 0 before it does
+SIZE = COUNTER.size + FIELDS.size + DRIVER.size
 ATTEMPTS = 10  # to read while the writer writes
 
 Memory = Array[c_char]
@@ -65,14 +67,23 @@ def read(memory: Memory) -> tuple[int, Snapshot] | None:
     return None
 
 
+def driver(memory: Memory) -> int:
+    """Return the id of the process that drives the cart; 0 before it does."""
+    (process,) = DRIVER.unpack_from(memory, SIZE - DRIVER.size)
+    return int(process)
+
+
 def followed(env: "CartPoleEnv", memory: Memory | None, row: int = 0) -> "CartPoleEnv":
     """Return `env`, whose cart is published in `memory` from now on, if there is one.
 
     Of many simulated carts it is that of `row`, and they are driven at the pace of a real one.
     """
-    if memory is not None and env.plant.drives_one_cart:
+    if memory is None:
+        return env
+    DRIVER.pack_into(memory, SIZE - DRIVER.size, os.getpid())
+    if env.plant.drives_one_cart:
         env.plant.on_command = Publisher(env, memory).on_command
-    elif memory is not None:
+    else:
         env.on_step = Publisher(env, memory, row).on_step
     return env
 

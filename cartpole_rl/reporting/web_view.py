@@ -27,7 +27,7 @@ from typing import Any, NamedTuple, Self
 
 from cartpole_rl.drawing import filled, shared_parts
 from cartpole_rl.errors import ConfigError
-from cartpole_rl.evaluation.snapshots import Memory, new_memory, read
+from cartpole_rl.evaluation.snapshots import Memory, driver, new_memory, read
 from cartpole_rl.reporting.live_view import LiveView
 from cartpole_rl.scheduling import lose_precedence
 from cartpole_rl.signals import end_with_parent, kept_from_children
@@ -135,11 +135,19 @@ class Stop:
     def __init__(self, process: int, number: int, stopped: Any, answer: str) -> None:
         self.process, self._number, self._stopped, self.answer = process, number, stopped, answer
 
-    def __call__(self) -> None:
-        """Send the signal, unless that process has ended."""
+    def __call__(self, memory: Memory | None) -> None:
+        """Send the signal, unless that process has ended; also to the one that drives the cart in `memory`.
+
+        A terminal sends it to both: a fine-tuning learns at the lowest priority, and may stop the motor late.
+        """
         self._stopped.value = 1
-        if os.getppid() == self.process:
-            os.kill(self.process, self._number)
+        if os.getppid() != self.process:
+            return
+        os.kill(self.process, self._number)  # first: it takes the other one's end for an error
+        driving = driver(memory) if memory else 0
+        if driving not in (0, self.process):
+            with suppress(ProcessLookupError):
+                os.kill(driving, self._number)
 
 
 class Site(NamedTuple):
@@ -224,7 +232,7 @@ class Handler(BaseHTTPRequestHandler):
             try:  # first: the parent ends this process
                 self.answer(200, text, "text/html")
             finally:
-                self.server.site.stop()
+                self.server.site.stop(self.server.site.memory)
         elif name is not None:
             self.answer(404, "There is nothing here.")
 

@@ -3,15 +3,18 @@
 import http.client
 import json
 import math
+import multiprocessing
 import os
 import signal
 import subprocess
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import count
+from multiprocessing.connection import Connection
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -20,7 +23,7 @@ from browser import BROWSER, BROWSERS
 from command_line import COARSE, in_process
 from toy_settings import TOY
 
-from cartpole_rl.evaluation.snapshots import Snapshot, write
+from cartpole_rl.evaluation.snapshots import Memory, Snapshot, followed, write
 from cartpole_rl.reporting import web_view
 from cartpole_rl.reporting.web_view import NOTE, WebView, page
 from cartpole_rl.workflows.config import TrainConfig, load_settings
@@ -122,11 +125,37 @@ def test_the_page_outlives_the_signals_of_a_terminal_from_its_first_moment() -> 
         assert ask(view.address, "GET", "")[0] == 200
 
 
-def press(address: str) -> None:
+def press(address: str, answer: str) -> None:
     """Press the button until it interrupts: Python loses an interrupt that comes in a destructor."""
     for _ in range(20):
-        assert "motor" not in ask(address, "POST", "stop")[1]  # there is none
+        assert answer in ask(address, "POST", "stop")[1]
         time.sleep(5)
+
+
+def drive_in_a_process_of_its_own(memory: Memory, events: Connection) -> None:
+    one_cart = SimpleNamespace(plant=SimpleNamespace(drives_one_cart=True))
+    followed(one_cart, memory)  # type: ignore[arg-type]
+    with suppress(KeyboardInterrupt):
+        events.send("drives")
+        time.sleep(100)
+    events.send("stopped")
+
+
+def test_the_button_reaches_the_process_that_drives() -> None:
+    """Beside its parent, which may be busy with learning."""
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe()
+    with WebView("cart", 0.36) as view:
+        driving = context.Process(target=drive_in_a_process_of_its_own, args=(view.memory, theirs))
+        driving.start()
+        try:
+            assert ours.recv() == "drives"
+            with pytest.raises(KeyboardInterrupt):
+                press(view.address, "motor")
+            assert ours.poll(30)
+            assert ours.recv() == "stopped"
+        finally:
+            driving.kill()
 
 
 def test_a_recording_is_shown_until_it_is_closed() -> None:
@@ -135,7 +164,7 @@ def test_a_recording_is_shown_until_it_is_closed() -> None:
         assert json.loads(ask(view.address, "GET", "recording?from=1")[1]) == []
         assert ask(view.address, "GET", "recording?from=x")[0] == 404
         with pytest.raises(KeyboardInterrupt):
-            press(view.address)
+            press(view.address, web_view.CLOSED)
 
 
 def test_words_of_a_title_are_no_markup() -> None:
