@@ -63,18 +63,19 @@ class FinetuningFiles:
         return read_recording(self.path(stage, number)).episode
 
     def check(self, learned: int) -> None:
-        """Raise RecordingError if an episode is missing before a recorded one, or one of the `learned`."""
+        """Raise RecordingError for a damaged episode, or a missing one of the `learned` or amid others."""
         evaluations, episodes = self.config.evaluation_episodes, self.config.episodes
         numbers = {Stage.BEFORE: evaluations, Stage.TUNE: episodes, Stage.AFTER: evaluations}
         paths = [self.path(stage, number) for stage, count in numbers.items() for number in range(count)]
-        missing = next((place for place, path in enumerate(paths) if not path.exists()), len(paths))
-        if learned and missing < evaluations + learned:
+        first = next((place for place, path in enumerate(paths) if damage(path)), len(paths))
+        if learned and first < evaluations + learned:
             remedy = f"put it back, or start anew: cartpole-finetune {as_word('run', self.config.run)}"
-        elif any(path.exists() for path in paths[missing:]):
-            remedy = "put it back, or move the later ones away: they are driven again"
+        elif any(path.exists() for path in paths[first:]):
+            these = "it and the later ones" if paths[first].exists() else "the later ones"
+            remedy = f"put it back, or move {these} away: they are driven again"
         else:
             return
-        raise RecordingError(f"resume={self.folder}: {RECORDINGS}/{paths[missing].name} is missing; {remedy}")
+        raise RecordingError(f"resume={self.folder}: {damage(paths[first])}; {remedy}")
 
     def episodes(self, stage: Stage) -> list[Episode]:
         """Read all recorded episodes of a stage, in order. Raises RecordingError."""
@@ -174,6 +175,17 @@ class FinetuningCart:
         if self.link is None:
             return {}
         return {**self.link.summary(), "latency_override": self.link.latency_override()}
+
+
+def damage(path: Path) -> str:
+    """Return what is wrong with the recording in a file; empty if nothing is."""
+    if not path.exists():
+        return f"{RECORDINGS}/{path.name} is missing"
+    try:
+        read_recording(path)
+    except RecordingError as error:
+        return str(error)
+    return ""
 
 
 def counts(stage: Stage, episode: Episode) -> bool:

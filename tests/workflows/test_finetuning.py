@@ -134,6 +134,22 @@ def test_a_checkpoint_restores_its_settings(files: FinetuningFiles) -> None:
         recorded_settings(FinetuneConfig, {"run": "somewhere", "prior": 0.1}, "resume=run")
 
 
+@pytest.mark.parametrize(
+    ("learned", "remedy"),
+    [(0, "put it back, or move it and the later ones away: they are driven again"), (3, "or start anew")],
+)
+def test_a_damaged_episode_is_refused_before_the_cart_moves(
+    learned: int, remedy: str, files: FinetuningFiles
+) -> None:
+    for stage in (Stage.BEFORE, Stage.TUNE):
+        for number in range(3):
+            files.write_episode(stage, number, EPISODE)
+    torn = files.path(Stage.TUNE, 1)
+    torn.write_text("\n".join(torn.read_text().splitlines()[:-1]))
+    with pytest.raises(RecordingError, match=f"tune_001.csv is damaged: its last row is missing; .*{remedy}"):
+        files.check(learned)
+
+
 LONG = replace(EPISODE, time=50 * EPISODE.time)  # 2 s
 
 
