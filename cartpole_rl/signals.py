@@ -50,7 +50,7 @@ class RaiseOnce:
         """Handle these signals from now on."""
         for number in numbers:
             signal.signal(number, self)
-        atexit.register(self._ignore, *numbers)
+        atexit.register(self._ignore)
         earlier = getattr(sys.unraisablehook, "__self__", None)
         self._unraisable = earlier._unraisable if isinstance(earlier, RaiseOnce) else sys.unraisablehook
         sys.unraisablehook = self._swallowed
@@ -59,6 +59,7 @@ class RaiseOnce:
         """Raise, unless the last error may still be unwinding."""
         now = time.monotonic()
         if now - self._raised_at >= UNWINDING:
+            atexit.register(self._ignore)  # once more: before what packages registered since `handle`
             self._raised_at, error = now, self._error(number)
             vars(error)[NUMBER] = number
             raise error
@@ -72,9 +73,9 @@ class RaiseOnce:
             again.start()
         self._unraisable(unraisable)
 
-    def _ignore(self, *numbers: int) -> None:
+    def _ignore(self) -> None:
         """Ignore the signals that are still handled here: Python would set them to their defaults."""
-        for number in numbers:
+        for number in (signal.SIGINT, *ending_signals()):
             if signal.getsignal(number) is self:
                 signal.signal(number, signal.SIG_IGN)
 

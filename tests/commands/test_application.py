@@ -90,6 +90,17 @@ def test_a_signal_that_python_swallowed_comes_again(monkeypatch: pytest.MonkeyPa
     assert len(swallowed) == 1
 
 
+def test_a_later_signal_while_the_program_exits_is_ignored() -> None:
+    """Also while the exit functions of packages run that were imported after the first lines."""
+    program = (
+        "import atexit, os, signal; from cartpole_rl import signals; signals.UNWINDING = 0; "
+        "signals.RaiseOnce(lambda number: SystemExit(128 + number)).handle(signal.SIGTERM); "
+        "atexit.register(os.kill, os.getpid(), signal.SIGTERM); os.kill(os.getpid(), signal.SIGTERM)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (143, "")
+
+
 def test_a_hangup_that_nohup_ignores_stays_ignored() -> None:
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     assert ending_signals() == [signal.SIGTERM]
