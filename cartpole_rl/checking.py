@@ -29,6 +29,8 @@ EXAMPLES = {  # of required settings
     "from": "from=<file or folder>",
     "plant.port": "plant.port=/dev/ttyUSB0 (cartpole-find-port lists the ports) or plant.port=auto",
     "plant.model": "plant.model=runs/model/<run>",
+    "plant.full": "plant.full=<what the board takes at motor value 255>, negative if its motor is reversed",
+    "plant.driver": "plant.driver=<module>:<class>",
     "learner.address": "learner.address=<host>:6379, the address of the Ray head",
 }
 REMEDIES = {  # by pydantic's type of error; the others keep pydantic's text

@@ -203,6 +203,8 @@ class _OwnChoices:
 
     def with_names(self, word: str) -> str:
         """Return an override of a command line with names of choices in place of files and mappings."""
+        if word.startswith("="):  # Hydra takes "" for a group
+            raise ConfigError(_no_override(word, ()))
         match = WORD.fullmatch(word)
         if match is None or not (conf_folder() / match[1]).is_dir() or match[1] == "hydra":
             return word

@@ -19,6 +19,7 @@ WRONG_TRAINING = [
     ("pole=lrage", "pole=lrage", "did you mean large?"),
     ("pole=medium,large", "pole=medium,large", "-m runs each"),
     ("seed", "seed", "key=value"),
+    ("=8", "=8", "key=value"),  # as $NAME=8 of a script
     ("experiment medium", "experiment medium", "did you mean experiment=medium?"),
     ("learning.epsilon=0.5", "learning.epsilon=0.5", "give a list, as [0.5]"),
     ("learning.epsilon=[0.5]", "learning.epsilon: ", "value 2 is missing"),

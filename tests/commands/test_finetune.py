@@ -198,6 +198,7 @@ def test_what_the_simulation_reads_is_missed_before_the_cart_moves(trained: Path
     [
         (("run=null",), "run"),
         (("plant=simulated",), "plant=simulated: this command takes emulated, serial"),
+        (("plant=text", "plant.port=x"), "plant.full is missing; give plant.full=<what the board takes at"),
         (
             ("finetuning.buffer_kind=prioritized",),
             "finetuning.buffer_kind=uniform, or finetuning.cart_share=0",
