@@ -152,6 +152,18 @@ def test_a_long_nominal_latency_is_simulated_as_it_is(tmp_path: Path) -> None:
 
 
 @needs_browser
+def test_a_key_that_is_released_in_another_window_pushes_no_longer(page: str, tmp_path: Path) -> None:
+    script = """
+    window.dispatchEvent(new KeyboardEvent("keydown", { key: "ArrowRight" }));
+    const held = keys;
+    window.dispatchEvent(new Event("blur"));
+    document.body.textContent = JSON.stringify([held, keys]);
+    """
+    held, left = in_browser(page, script, tmp_path)
+    assert held > left == 0
+
+
+@needs_browser
 def test_it_drives_as_the_simulation(page: str, medium_agent: TrainedAgent, tmp_path: Path) -> None:
     script = f"const EPISODES = {json.dumps(EPISODES)}, PERIODS = {PERIODS};{DRIVE}"
     for episode, rows in zip(EPISODES, in_browser(page, script, tmp_path), strict=True):

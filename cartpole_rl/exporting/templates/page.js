@@ -146,6 +146,7 @@ window.addEventListener("keydown", (event) => {
 window.addEventListener("keyup", (event) => {
   if (event.key in ARROWS) keys = 0;
 });
+window.addEventListener("blur", () => (keys = 0)); // the release goes to another window
 
 function apply() {
   const friction = Number(element("friction").value), pole = DATA.poles[element("pole").value];
