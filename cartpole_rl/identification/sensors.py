@@ -85,8 +85,6 @@ class Samples:
     """Smoothed motion [K] of all recordings, away from their ends, and the piece of each row."""
 
     def __init__(self, motions: Sequence[Motion], period: float, rows: int) -> None:
-        from scipy.signal import savgol_coeffs  # slow to import
-
         edge, piece = rows // 2, 0
         kept, pieces = [], []
         for motion in motions:
@@ -96,7 +94,10 @@ class Samples:
             pieces.append(piece + inside // PIECE)
             piece = int(pieces[-1][-1]) + 1
         self._kept, self._period = np.concatenate(kept), period
-        self._weights = np.cumsum(np.cumsum(savgol_coeffs(rows, 3, deriv=2)))[:-2]  # [rows - 2], sum 1
+        cubic = np.linalg.pinv(
+            np.vander(np.arange(-edge, edge + 1), 4)
+        )  # its coefficients, from `rows` values
+        self._weights = np.cumsum(np.cumsum(2 * cubic[1]))[:-2]  # of second differences, [rows - 2], sum 1
         self.piece = np.unique(np.concatenate(pieces)[self._kept], return_inverse=True)[1]
         self._theta = np.concatenate([motion.theta for motion in motions])
         x = np.concatenate([motion.x for motion in motions])

@@ -9,26 +9,29 @@ from page import BEYOND
 from page_commands import ROOT
 from results import StudyResults
 from small_results import found
-from study import study_names
+from study import STUDIES, study_names
 
 BEYOND_IT = re.compile(r"(\| [^|]+ ){2,}\| `(?P<study>\w+)` \|")
-CLAIMS = read_claims()
-EVIDENCE = stored()
-RESULTS = [*EVIDENCE.results.values()]
+read_claims, stored = cache(read_claims), cache(stored)  # half a second, and not where tests are collected
+
+
+def every_result() -> list[StudyResults]:
+    return [*stored().results.values()]
 
 
 def test_every_study_has_results() -> None:
-    assert {each.name for each in RESULTS} == {*study_names()}
+    assert {each.name for each in every_result()} == {*study_names()}
 
 
-@pytest.mark.parametrize("results", RESULTS, ids=lambda results: results.name)
-def test_the_data_are_complete_and_have_a_finding(results: StudyResults) -> None:
+@pytest.mark.parametrize("study", sorted(path.stem for path in STUDIES.glob("*.yaml")))
+def test_the_data_are_complete_and_have_a_finding(study: str) -> None:
+    results = stored().results[study]
     assert (results.label, results.missing(), results.exclusions) == ("full", [], ())
     assert results.finding is not None
 
 
 def test_set_ups_have_ten_agents() -> None:
-    counts = {each.name: {len(each.members(arm.name)) for arm in each.groups} for each in RESULTS}
+    counts = {each.name: {len(each.members(arm.name)) for arm in each.groups} for each in every_result()}
     few = {name: min(count) for name, count in counts.items() if count != {10}}  # as their rows say
     three = ("balance_poles", "classical_reward", "falls", "fine_tuning_cart_alone", "lengths_on_cart")
     others = {"integrators": 2, "one_cart": 4, "bearing_and_drag": 6, "nine_levels": 5}
@@ -37,7 +40,7 @@ def test_set_ups_have_ten_agents() -> None:
 
 @cache
 def generated() -> dict[str, str]:
-    return blocks(CLAIMS, EVIDENCE)
+    return blocks(read_claims(), stored())
 
 
 @pytest.mark.parametrize("page", PAGES)
@@ -49,10 +52,10 @@ def test_tables_verdicts_and_numbers_are_those_of_the_data(page: str) -> None:
 def test_each_study_of_the_thesis_has_a_row_and_the_verdict_of_its_rows() -> None:
     verdicts = {
         each.name: {"fails": "new"}.get(each.finding.verdict, each.finding.verdict)
-        for each in RESULTS
+        for each in every_result()
         if each.finding and each.study.order < BEYOND
     }
-    assert EVIDENCE.study_words(CLAIMS.rows) == verdicts
+    assert stored().study_words(read_claims().rows) == verdicts
 
 
 @pytest.mark.parametrize(
@@ -90,4 +93,4 @@ def rows(page: str, row: re.Pattern[str]) -> list[re.Match[str]]:
 
 def test_the_page_of_the_thesis_has_each_study_beyond_it() -> None:
     shown = {row["study"] for row in rows("docs/thesis.md", BEYOND_IT)} & {*study_names()}
-    assert shown == {each.name for each in RESULTS if each.study.order >= BEYOND}
+    assert shown == {each.name for each in every_result() if each.study.order >= BEYOND}

@@ -10,7 +10,7 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import nullcontext, suppress
-from functools import partial
+from functools import cache, partial
 from multiprocessing import Pipe
 from pathlib import Path
 from threading import Thread
@@ -44,7 +44,6 @@ from cartpole_rl.workflows.ray_learner import (
     version_finder,
 )
 
-TRAINING = load_settings(TrainConfig, {"agent.hidden": [8, 8]})
 SETTINGS = RayLearnerSettings(kind="ray", address="server:6379", episodes_ahead=2, timeout=10.0)
 CUT = b"\x00\x00\x00\x64x"  # the beginning of a message of 100 bytes in a pipe
 CONFIG = {"run": "somewhere", "learner": SETTINGS.model_dump(), "episodes": 4, "evaluation_episodes": 1}
@@ -85,11 +84,21 @@ class Cart:
         self.curves.append(learned)
 
 
+@cache
+def training() -> TrainConfig:
+    return load_settings(TrainConfig, {"agent.hidden": [8, 8]})
+
+
+@cache
+def new_weights() -> Weights:
+    return as_weights(new_agent(training()))
+
+
 def weights_of(value: float) -> Weights:
     """The weights of an agent, all of them `value`."""
     return {
         name: np.full_like(weight, value) if weight.dtype.kind == "f" else weight
-        for name, weight in as_weights(new_agent(TRAINING)).items()
+        for name, weight in new_weights().items()
     }
 
 
@@ -100,7 +109,7 @@ class Session:
         self.files = FinetuningFiles(folder, load_settings(FinetuneConfig, CONFIG))
         state = {name: torch.tensor(weight) for name, weight in weights_of(0).items()}
         self.tuned = TunedAgent(
-            TRAINING, AgentCheckpoint(TRAINING.model_dump(mode="json"), state, 0, None), None
+            training(), AgentCheckpoint(training().model_dump(mode="json"), state, 0, None), None
         )
         self.tuned.state[NAME] = "run"
         self.link, self.cart, self.looks = Network(), Cart(self.files), list[int]()
@@ -168,18 +177,30 @@ def test_when_the_learner_returns_it_catches_up_first(session: Session) -> None:
 @pytest.mark.parametrize(
     ("version", "weights", "told"),
     [
-        (1, weights_of(float("nan")), "version 1 of the learner's weights are refused: its weight "),
-        (1, {"weight": np.full(3, 7.0)}, "weights are refused: they are of another network; the earlier"),
-        (1, {name: each.astype("f2") for name, each in weights_of(7.0).items()}, "of another network"),
-        (0, weights_of(7.0), ""),
-        (5, weights_of(7.0), ""),
+        (1, lambda: weights_of(float("nan")), "version 1 of the learner's weights are refused: its weight "),
+        (
+            1,
+            lambda: {"weight": np.full(3, 7.0)},
+            "weights are refused: they are of another network; the earlier",
+        ),
+        (
+            1,
+            lambda: {name: each.astype("f2") for name, each in weights_of(7.0).items()},
+            "of another network",
+        ),
+        (0, lambda: weights_of(7.0), ""),
+        (5, lambda: weights_of(7.0), ""),
     ],
     ids=["nan", "another network", "another type", "same", "beyond the run"],
 )
 def test_weights_that_cannot_be_used_never_drive(
-    version: int, weights: Weights, told: str, session: Session, capsys: pytest.CaptureFixture[str]
+    version: int,
+    weights: Callable[[], Weights],
+    told: str,
+    session: Session,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    take(Offer(version, weights), session.files, session.tuned)
+    take(Offer(version, weights()), session.files, session.tuned)
     assert session.tuned.learned == 0
     assert not any(weight.any() for weight in session.tuned.weights.values())
     assert told in capsys.readouterr().err
@@ -188,7 +209,7 @@ def test_weights_that_cannot_be_used_never_drive(
 def test_weights_that_arrived_are_kept_for_a_resumption(session: Session) -> None:
     take(Offer(2, weights_of(2)), session.files, session.tuned)
     saved = load_training(session.files.folder, FINETUNING_FORMAT)
-    resumed = TunedAgent(TRAINING, session.tuned.start, saved)
+    resumed = TunedAgent(training(), session.tuned.start, saved)
     assert (resumed.learned, resumed.state[NAME]) == (2, "run")
     expected = weights_of(2)
     assert all(np.array_equal(expected[name], each) for name, each in as_weights(resumed.agent).items())
@@ -202,7 +223,7 @@ def test_a_resumption_logs_no_curve_again(version: int, curves: list[int], sessi
     """
     session.files.save({"agent": session.tuned.agent.state_dict(), NAME: "run"}, version)
     saved = load_training(session.files.folder, FINETUNING_FORMAT)
-    session.tuned = TunedAgent(TRAINING, session.tuned.start, saved)
+    session.tuned = TunedAgent(training(), session.tuned.start, saved)
     for each in (*range(5), 4):
         session.offer(each)
     session.tune(lambda count, looks: None)
