@@ -87,8 +87,8 @@ class Recorder(TorchDispatchMode):
         files = [(Path(call.filename), call.lineno) for call in traceback.extract_stack()]
         own = [call for call in files if TORCH not in call[0].parents and call[0] != Path(__file__)]
         raise ConfigError(
-            f"{own[-1][0]}, line {own[-1][1]}: a formula cannot branch on a number of the carts; "
-            "use torch.where(condition, one, other)"
+            f"{own[-1][0]}, line {own[-1][1]}: a formula cannot read a number of the carts, as `if`, "
+            "float() and NumPy do; use functions of torch, as torch.where(condition, one, other)"
         )
 
     def __torch_dispatch__(
@@ -140,7 +140,7 @@ def trace(
 ) -> Trace:
     """Return the graph of `function`, which stores each part of the result as `store` returns it.
 
-    Raises ConfigError for a function that branches on a number of a tensor.
+    Raises ConfigError for a function that reads a number of a tensor, as a branch does.
     """
     inputs = [*map(copied, chain.from_iterable(arguments))]
     recorder, rest = Recorder(inputs), iter(inputs)

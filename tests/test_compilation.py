@@ -64,11 +64,11 @@ def test_it_computes_the_same_in_every_call(kind: type[Compiled[Moved]] | type[T
     ],
     ids=["branch", "list", "NumPy"],
 )
-def test_a_branch_on_a_number_is_refused_by_its_line(kind: Any, is_fast: Callable[[Tensor], Any]) -> None:
+def test_a_number_that_is_read_is_refused_by_its_line(kind: Any, is_fast: Callable[[Tensor], Any]) -> None:
     def braked(speed: tuple[Tensor]) -> tuple[Tensor]:
         return (-speed[0] if is_fast(speed[0]) else speed[0],)
 
-    with pytest.raises(ConfigError, match=r"test_compilation\.py, line \d+: a formula cannot branch"):
+    with pytest.raises(ConfigError, match=r"test_compilation\.py, line \d+: a formula cannot read a number"):
         kind(braked, (torch.rand(7),)) if kind is Scalar else kind(braked)((torch.rand(7),))
 
 
