@@ -161,5 +161,7 @@ def _content(path: Path, expected: str) -> dict[str, Any]:
     found = content.pop("format", None) if isinstance(content, dict) else None
     if found != expected:
         held = f"it is {CONTENT[found]}" if found in CONTENT else f"its format is {found!r}, not {expected!r}"
+        if str(found).startswith(expected.rstrip("0123456789")):
+            held += ", but that of another version; use that version, or start anew"
         raise CheckpointError(f"{path} is not {CONTENT[expected]} of this package: {held}")
     return content

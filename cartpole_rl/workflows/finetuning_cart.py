@@ -75,7 +75,7 @@ class FinetuningFiles:
             remedy = f"put it back, or move {these} away: they are driven again"
         else:
             return
-        raise RecordingError(f"resume={self.folder}: {damage(paths[first])}; {remedy}")
+        raise RecordingError(f"{damage(paths[first])}; {remedy}")
 
     def episodes(self, stage: Stage) -> list[Episode]:
         """Read all recorded episodes of a stage, in order. Raises RecordingError."""
@@ -180,7 +180,7 @@ class FinetuningCart:
 def damage(path: Path) -> str:
     """Return what is wrong with the recording in a file; empty if nothing is."""
     if not path.exists():
-        return f"{RECORDINGS}/{path.name} is missing"
+        return f"{path} is missing"
     try:
         read_recording(path)
     except RecordingError as error:

@@ -86,6 +86,8 @@ def test_a_torch_file_of_another_kind_is_named(tmp_path: Path) -> None:
     for content in ({"state_dict": {}}, torch.zeros(3)):
         torch.save(content, tmp_path / "other.pt")
         check_refused(load_agent, tmp_path / "other.pt", "its format is None")
+    torch.save({"format": "cartpole_rl agent 0"}, tmp_path / "other.pt")
+    check_refused(load_agent, tmp_path / "other.pt", "use that version, or start anew")
     save_training(tmp_path, TRAINING)
     check_refused(load_agent, tmp_path / RESUME, "not an agent")
 
