@@ -242,15 +242,21 @@ def run(verb: str) -> None:
 
 
 def main() -> None:
-    """Run `cartpole <verb> ...`; without a verb, list the verbs."""
+    """Run `cartpole <verb> ...`; without a verb, list the verbs. Refuse another one in a line."""
     first = sys.argv[1] if len(sys.argv) > 1 else "--help"
     verb = first.replace("-", "_")
     if verb in VERBS:
         sys.argv[:2] = [program(verb)]
-        return run(verb)
+        run(verb)
+        return
+    if first not in ("--help", "-h"):
+        from cartpole_rl.checking import nearest_choice  # imports pydantic
+
+        verbs = [name.replace("_", "-") for name in VERBS]
+        print(f"cartpole: {first}: there is no such verb; {nearest_choice(first, verbs)}", file=sys.stderr)
+        sys.exit(2)
     lines = (f"  {name.replace('_', '-'):12}{row.about.splitlines()[0]}" for name, row in VERBS.items())
     print("cartpole <verb> ..., as `cartpole train --help`. The verbs:", *lines, sep="\n")
-    sys.exit(0 if first in ("--help", "-h") else 2)
 
 
 def __getattr__(verb: str) -> Callable[[], None]:

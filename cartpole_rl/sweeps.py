@@ -73,7 +73,7 @@ def sweep_folder(command: str) -> str:
 
 def new_folder(command: str, label: str) -> str:
     """Make a new folder named by date, time and `label`, and return its path."""
-    name = datetime.now().strftime("%Y-%m-%d_%H-%M-%S") + (f"_{label}" if label else "")
+    name = datetime.now().strftime("%Y-%m-%d_%H-%M-%S") + (f"_{label}" if label else "").replace("/", "-")
     for number in count(1):
         folder = Path("runs", command, name if number == 1 else f"{name}_{number}")
         with suppress(FileExistsError):

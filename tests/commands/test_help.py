@@ -11,6 +11,7 @@ from every_command import SCHEMAS
 from cartpole_rl import __version__
 from cartpole_rl.checking import validated
 from cartpole_rl.choices import conf_folder
+from cartpole_rl.cli import main
 from cartpole_rl.composition import compose
 
 WITHOUT_A_SETTING = {"train": {"experiment", "sweep"}}  # groups that set other groups, or what is swept
@@ -50,3 +51,12 @@ def test_help(command: str, tmp_path: Path) -> None:
 def test_version_is_that_of_the_package(tmp_path: Path) -> None:
     done = in_process("train", "--version", folder=tmp_path)
     assert (done.code, done.out) == (0, f"cartpole_rl {__version__}\n")
+
+
+def test_a_wrong_verb_is_named(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr("sys.argv", ["cartpole", "trian"])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    out, err = capsys.readouterr()
+    assert (ended.value.code, out, err.count("\n")) == (2, "", 1)
+    assert err.startswith("cartpole: trian: there is no such verb; did you mean train? there are train, ")

@@ -335,3 +335,13 @@ def test_episodes_before_a_broken_link_are_reported(
     metrics = read(tmp_path / "it/metrics.json")
     assert len(metrics["episodes"]) == 1
     assert metrics["score"]["low"] is None
+
+
+@pytest.mark.parametrize("label", ["small/fast", "../../small"])
+def test_a_label_leads_to_no_other_folder(
+    label: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    made = Path(run_folder("train", label))
+    assert [*Path("runs/train").iterdir()] == [made]
+    assert made.name.endswith(label.replace("/", "-"))
