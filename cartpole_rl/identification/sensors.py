@@ -94,10 +94,9 @@ class Samples:
             pieces.append(piece + inside // PIECE)
             piece = int(pieces[-1][-1]) + 1
         self._kept, self._period = np.concatenate(kept), period
-        cubic = np.linalg.pinv(
-            np.vander(np.arange(-edge, edge + 1), 4)
-        )  # its coefficients, from `rows` values
-        self._weights = np.cumsum(np.cumsum(2 * cubic[1]))[:-2]  # of second differences, [rows - 2], sum 1
+        cubic = np.linalg.pinv(np.vander(np.arange(-edge, edge + 1), 4))  # through `rows` values
+        # its second derivative, from their second differences, [rows - 2], sum 1
+        self._weights = np.cumsum(np.cumsum(2 * cubic[1]))[:-2]
         self.piece = np.unique(np.concatenate(pieces)[self._kept], return_inverse=True)[1]
         self._theta = np.concatenate([motion.theta for motion in motions])
         x = np.concatenate([motion.x for motion in motions])

@@ -56,7 +56,13 @@ CHECKOUT = Path(__file__).resolve().parents[2]
 DATA = CHECKOUT / "docs/results/thesis"
 BENCHES = CHECKOUT / "docs/results/data"
 CLAIMS = Path(__file__).with_name("claims.yaml")
-PAGES = ("README.md", "docs/thesis.md", "docs/thesis-results.md", "docs/results/learning.md")
+PAGES = (
+    "README.md",
+    "docs/thesis.md",
+    "docs/thesis-results.md",
+    "docs/results/learning.md",
+    "docs/results/learned-model.md",
+)
 BLOCK = re.compile(r"(<!-- claims: (\w+) -->\n)((?:.+\n)*)")
 FORMULA = re.compile(r"\{([^{}]+)\}")
 WIDTH = 120  # characters of a line of text
@@ -83,7 +89,7 @@ class Row(Settings):
     thesis: str
     here: str = ""
     otherwise: str = ""  # what was done otherwise than in the thesis
-    study: str = ""  # empty: not asked yet; `otherwise` then says why, and what it would cost
+    study: str = ""  # or a bench's script; empty: not asked yet, `otherwise` says why and what it would cost
     claim: str = ""  # statements, separated by ";"; empty: the thesis has no result
     because: bool = False  # what was done otherwise could turn the result round
 
@@ -261,7 +267,7 @@ class Evidence:
         """Return the verdict of each study: the first of those of its rows, in the order of Word."""
         words: dict[str, list[Word]] = {}
         for row in rows:
-            if row.study:
+            if row.study and not row.study.endswith(".py"):
                 words.setdefault(row.study, []).append(self.word(row))
         return {study: min(found, key=[*Word].index) for study, found in words.items()}
 

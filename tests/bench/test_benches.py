@@ -10,6 +10,7 @@ import adaptation
 import export_parity
 import fine_tuning
 import learning
+import next_state
 import numpy as np
 import pytest
 import real
@@ -21,14 +22,19 @@ import truth_references
 import zero_shot
 from bench_scripts import Run
 from best_score.cart import KnownCart
-from common import REFERENCES
+from common import REFERENCES, failure
+from tensordict import TensorDict
 from truths import REPORTED, draw_truths, simulated_cart
 
 from cartpole_rl.choices import choice
 from cartpole_rl.emulator.settings import EmulatorSettings
+from cartpole_rl.evaluation.recordings import read_recording
 from cartpole_rl.identification.windows import Windows, history_periods
+from cartpole_rl.plants.settings import SimulatedSettings
 from cartpole_rl.randomization.ranges import Range
+from cartpole_rl.run_folder import recordings
 from cartpole_rl.tasks.rewards import UPRIGHT_ANGLE
+from cartpole_rl.workflows.build import simulated_env
 from cartpole_rl.workflows.config import TrainConfig, load_settings
 
 pytestmark = pytest.mark.nightly
@@ -71,6 +77,28 @@ def test_exported_agents_choose_the_hosts_actions(run: Run, tmp_path: Path, monk
     values = np.array([[1.0, 2.0], [3.0, np.float32(3.0) + above], [5.0, 4.0]], np.float32)
     found = export_parity.row("x", np.array([0, 0, 0]), values)
     assert (found["differ"], found["beyond rounding"]) == (2, 1)
+
+
+def test_a_network_alone_predicts_and_moves_carts(tmp_path: Path, monkeypatch: Any) -> None:
+    words = ("run=pretrained/medium", "episodes=3", f"hydra.run.dir={tmp_path / 'run'}")
+    assert failure("record", *words) is None
+    *episodes, held_out = (read_recording(path).episode for path in recordings(tmp_path / "run"))
+    errors = []
+    for updates in (1, 500):
+        monkeypatch.setattr(next_state, "UPDATES", updates)
+        network = next_state.learned(episodes, 0)
+        errors.append(next_state.prediction_error(network, held_out).theta)
+    assert errors[1] < 0.3 * errors[0]
+    monkeypatch.setattr(SimulatedSettings, "build", lambda *given: next_state.network_carts(network, *given))
+    config = load_settings(TrainConfig, {"randomization": "none"})
+    plant = simulated_env(config, config.plant, 3, config.task.start, 0).plant
+    plant.reset()
+    motors, states = torch.tensor([[9], [-90], [255]]), [torch.stack(plant.true_state, -1)]
+    for _ in range(2):
+        plant.step(TensorDict({"motor": motors}, [3]))
+        states.append(torch.stack(plant.true_state, -1))
+    expected = network(states[1], torch.cat((torch.zeros(3, 2), motors, motors), 1))
+    assert torch.equal(states[2], expected)
 
 
 def test_fine_tunings_are_compared_with_the_reference_of_the_cart() -> None:
