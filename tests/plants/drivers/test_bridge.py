@@ -218,10 +218,11 @@ def test_preflight_says_why_a_board_is_lost(caplog: pytest.LogCaptureFixture) ->
     words = ""
     with (
         suppress(EmulatorError),  # of the bridge that has ended
-        board(at=2, silent=True) as (port, _),
+        board() as (port, process),
         TextSettings(**STEPPER, port=port).reachable(EmulatorSettings(), RIG) as (settings, server),
         closing(SerialCart(settings, RIG, server=server)) as cart,
     ):
+        process.send_signal(signal.SIGSTOP)  # not by its own clock: the bridge may be slow to start
         words = [*preflight(cart)][-1].words
     assert words.startswith(f"no measurement came from {port} for")
     assert "may still be on" not in caplog.text

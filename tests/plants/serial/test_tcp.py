@@ -62,9 +62,14 @@ def test_it_listens_to_this_computer_alone() -> None:
 
 
 def states(port: str) -> list[State]:
-    """The states of a cart in lockstep; sequences begin anywhere."""
+    """The states of a cart in lockstep; sequences and ticks begin anywhere."""
     with connected(port=port) as cart:
-        return [replace(cart.poll_state(), last_sequence=0) for _ in range(60)]
+        found = [cart.poll_state() for _ in range(60)]
+    first = found[0]
+    return [
+        replace(each, last_sequence=0, tick=each.tick - first.tick, time_us=each.time_us - first.time_us)
+        for each in found
+    ]
 
 
 def test_lockstep_is_the_same_as_over_a_pseudo_terminal() -> None:
