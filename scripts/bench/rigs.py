@@ -5,7 +5,7 @@
 
 For each rig: preflight and identification on an emulated cart, then for each seed a training, an evaluation
 of the last checkpoint on the nominal cart and on the emulated one, its C export driving on the emulated
-board, and a fine-tuning. The emulated cart differs from the rig's file as the default one from ip02. A
+board, a fine-tuning, and a training on the identification, evaluated on the emulated cart. The emulated cart differs from the rig's file as the default one from ip02. A
 fraction is a score over the best one that reference.py finds with the same settings: on the rig's nominal
 cart from any of its starts, and on a simulated cart with the numbers of the emulated one. The runs are in
 runs/bench/rigs; what exists is not made again.
@@ -65,6 +65,8 @@ RIGS = (
     Rig("laboratorio", "laboratorio", 0.01, "nine_levels_fine", "dc"),
     Rig("stepper", "rod_03", 0.01, "nine_levels_fine", "stepper"),
 )
+
+POLE_FRICTION = "bearing"  # the one that cartpole-identify fits
 
 
 def words(settings: dict[str, Any]) -> list[str]:
@@ -148,7 +150,21 @@ def driven(rig: Rig, folder: Path, seed: int) -> dict[str, Any]:
         "emulated": mean_score(evaluated("emulated", *rig.emulated, "episodes=5")),
         "onboard": onboard_score(evaluated("onboard", *rig.emulated, *onboard, "episodes=3")),
         "tuned": read_json(tuned / "comparison.json"),
+        "identified": mean_score(identified_agent(rig, folder, seed)),
     }
+
+
+def identified_agent(rig: Rig, folder: Path, seed: int) -> Path:
+    """Train on the identification, as `cartpole-identify` says; return the metrics on the emulated cart."""
+    found = folder / "identify"
+    report = read_json(found / "identification.json")
+    files = {group: str(found / f"{group}.yaml") for group in ("cart", "pole", "randomization")}
+    frictions = {"cart_friction": report["cart_friction"], "pole_friction": POLE_FRICTION}
+    parent = folder / str(seed)
+    settings = words({**rig.training, **files, **frictions})
+    run = run_once(parent / "identified", "train", *settings, f"seed={seed}")
+    name, emulated = parent / "identified_emulated", (*rig.emulated, "episodes=5")
+    return run_once(name, "evaluate", f"run={run}", *emulated) / "metrics.json"
 
 
 def onboard_score(file: Path) -> float:
@@ -188,7 +204,10 @@ def main() -> None:
                     "seed": str(seed),
                     "references": f"{best:.0f}, {emulated:.0f}",
                     **{name: f"{figures[name] / best:.3f}" for name in ("nominal", "drawn")},
-                    **{name: f"{figures[name] / emulated:.3f}" for name in ("emulated", "onboard")},
+                    **{
+                        name: f"{figures[name] / emulated:.3f}"
+                        for name in ("emulated", "onboard", "identified")
+                    },
                 }
             )
     print_table(rows)
