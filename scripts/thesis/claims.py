@@ -20,6 +20,7 @@ A statement is a statistic (STATISTICS) with its values, an operator and a numbe
 """
 
 import json
+import math
 import re
 import sys
 from collections import Counter
@@ -68,6 +69,7 @@ FORMULA = re.compile(r"\{([^{}]+)\}")
 WIDTH = 120  # characters of a line of text
 NEAR = 0.05  # an interval within this of a number agrees with "= number"
 LIKE, DROPPED = 50, 250  # of 500: agents that differ by less are alike, the pole is dropped below
+NEVER = {"seconds_to_reached": math.inf, "transitions_to_reached": math.inf, "kept": 0.0}  # of such a seed
 LATE, MIDDLE = 0.75, 0.5  # shares of a training: its last quarter begins, its second one ends
 
 
@@ -348,7 +350,7 @@ def bench_values(folder: Path = BENCHES) -> dict[str, Array]:
     """Return the values of the benches' agents: learning/medium/failed, learning/range/1.0_m/fraction.
 
     A file of learning.py has experiments, with the figures of each seed and of each of its poles; those of
-    zero_shot.py and fine_tuning.py have a list of agents.
+    zero_shot.py and fine_tuning.py have a list of agents. A seed that never reaches a fraction counts, too.
     """
     found: dict[str, list[float]] = {}
 
@@ -356,8 +358,9 @@ def bench_values(folder: Path = BENCHES) -> dict[str, Array]:
         for key, value in figures.items():
             if isinstance(value, Mapping):
                 add(f"{name}/{key.replace(' ', '_')}", value)
-            elif isinstance(value, int | float):
-                found.setdefault(f"{name}/{key}", []).append(float(value))
+            elif isinstance(value, int | float | None):
+                number = NEVER.get(key, math.nan) if value is None else float(value)
+                found.setdefault(f"{name}/{key}", []).append(number)
 
     for file in sorted(folder.glob("*.json")):
         content = json.loads(file.read_text(encoding="utf-8"))

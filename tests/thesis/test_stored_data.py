@@ -1,10 +1,13 @@
 """The stored results of the studies: complete data, and pages whose tables and verdicts are theirs."""
 
+import json
+import math
 import re
 from functools import cache
+from pathlib import Path
 
 import pytest
-from claims import PAGES, Evidence, Row, Word, blocks, read_claims, rebuilt, stored
+from claims import PAGES, Evidence, Row, Word, bench_values, blocks, read_claims, rebuilt, stored
 from page import BEYOND
 from page_commands import ROOT
 from results import StudyResults
@@ -85,6 +88,16 @@ def test_the_word_follows_the_interval(claim: str, word: Word) -> None:
     assert evidence.word(row) is word
     explained = row.model_copy(update={"because": True})
     assert evidence.word(explained) is (Word.DIFFERS if word is Word.CONTRADICTS else word)
+
+
+def test_a_seed_that_never_learned_counts(tmp_path: Path) -> None:
+    seeds = [
+        {"plants": {"x": {"score": 1.0}}, "seconds_to_reached": each, "kept": each} for each in (0.5, None)
+    ]
+    (tmp_path / "learning.json").write_text(json.dumps({"medium": dict(zip("01", seeds, strict=True))}))
+    found = bench_values(tmp_path)
+    assert found["learning/medium/seconds_to_reached"].tolist() == [0.5, math.inf]
+    assert found["learning/medium/kept"].tolist() == [0.5, 0.0]
 
 
 def rows(page: str, row: re.Pattern[str]) -> list[re.Match[str]]:
