@@ -42,6 +42,7 @@ from cartpole_rl.tasks.features import Measured
 from cartpole_rl.tasks.rewards import score
 
 PERIOD, TIME_LIMIT = 0.02, 500  # s; periods
+WIDE, WHOLE = 8192, 4096  # carts of the dynamics and of the whole environment
 ROLLOUT = 32  # steps
 CARTPOLE = "Gymnasium CartPole"
 PENDULUM_STEP, PENDULUM_ROLLOUT = "PendulumEnv, step", "PendulumEnv, rollout"
@@ -102,7 +103,7 @@ def run_dynamics(carts: Carts, inputs: Inputs, *, substeps: int) -> Carts:
     return Carts(*state, force, motor, steps, total)
 
 
-def dynamics(carts: int, periods: int, substeps: int, compiled: bool) -> Row:
+def dynamics(carts: int, periods: int, substeps: int) -> Row:
     """Return the row of our dynamics."""
     plant = simulated_environment("swingup", carts, "wide").plant
     generator = torch.Generator().manual_seed(0)
@@ -115,8 +116,7 @@ def dynamics(carts: int, periods: int, substeps: int, compiled: bool) -> Row:
         )
         for _ in range(4)
     ]
-    plain = partial(run_dynamics, substeps=substeps)
-    run = Compiled(plain) if compiled else plain
+    run = Compiled(partial(run_dynamics, substeps=substeps))
     state = Carts(*draws[0].starts, *torch.zeros(4, carts))
     calls = 0
 
@@ -157,9 +157,9 @@ def stepper(env: EnvBase, present: TensorDictBase, actions: Tensor) -> Step:
     return step
 
 
-def environments(carts: int, compiled: bool) -> list[Row]:
+def environments(carts: int) -> list[Row]:
     """Return the rows of our environment."""
-    fast, plain = (simulated_environment("swingup", carts, "wide", each) for each in (compiled, False))
+    fast, plain = (simulated_environment("swingup", carts, "wide", each) for each in (True, False))
     actions = torch.randint(len(plain.hardware.motors), (16, carts))
     step, plain_step = (stepper(env, env.reset(), actions) for env in (fast, plain))
     rollout = partial(fast.rollout, ROLLOUT, break_when_any_done=False)
@@ -195,11 +195,11 @@ def seconds(step: Step) -> float:
     return time.perf_counter() - started
 
 
-def seconds_a_call(step: Step, length: float) -> float:
-    """Return the mean seconds of the calls in a round of `length` s, without the first call."""
+def seconds_a_call(step: Step) -> float:
+    """Return the mean seconds of the calls in a round of ROUND s, without the first call."""
     step()
     calls, started, passed = 0, time.perf_counter(), 0.0
-    while calls == 0 or passed < length:
+    while passed < ROUND:
         step()
         calls, passed = calls + 1, time.perf_counter() - started
     return passed / calls
@@ -211,20 +211,19 @@ def fastest(rows: list[Row], budget: float) -> dict[str, float]:
     ends = time.perf_counter() + budget
     while time.perf_counter() < ends or np.inf in best.values():
         for row in rows:
-            best[row.name] = min(best[row.name], seconds_a_call(row.step, ROUND if budget else 0.0))
+            best[row.name] = min(best[row.name], seconds_a_call(row.step))
     return {row.name: row.carts * row.periods / best[row.name] for row in rows}
 
 
-def measure(threads: int, budget: float, quick: bool) -> list[dict[str, Any]]:
+def measure(threads: int, budget: float) -> list[dict[str, Any]]:
     """Measure all rows with `threads` torch threads; Gymnasium's NumPy uses one."""
     torch.set_num_threads(threads)
-    wide, whole = (64, 32) if quick else (8192, 4096)
-    rows = [cartpole(wide), *(dynamics(wide, *each, not quick) for each in ((1, 1), (1, 4), (8, 1)))]
-    rows += [*pendulums(whole), *environments(whole, not quick)]
+    rows = [cartpole(WIDE), *(dynamics(WIDE, *each) for each in ((1, 1), (1, 4), (8, 1)))]
+    rows += [*pendulums(WHOLE), *environments(WHOLE)]
     for row in rows:
-        for _ in range(1 if quick else MIXING // row.periods):
+        for _ in range(MIXING // row.periods):
             row.step()
-    speed = fastest(rows, 0.0 if quick else budget)
+    speed = fastest(rows, budget)
     return [
         {
             "name": row.name,
@@ -261,11 +260,8 @@ def main() -> None:
     parser.add_argument(
         "--seconds", type=float, default=30.0, help="of measurement for each number of threads (30)"
     )
-    parser.add_argument(
-        "--quick", action="store_true", help="only check that it runs: few carts, one round, nothing compiled"
-    )
     options = parser.parse_args()
-    results = [row for threads in options.threads for row in measure(threads, options.seconds, options.quick)]
+    results = [row for threads in options.threads for row in measure(threads, options.seconds)]
     print(show(results))
     write_json(options.json, results)
 

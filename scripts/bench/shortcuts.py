@@ -1,7 +1,7 @@
 #!/usr/bin/env python
 """Speed of this package's replacements of TorchRL parts, measured in one process and in turns.
 
-    scripts/bench/shortcuts.py [--json shortcuts.json] [--carts 1024] [--seconds 60] [--quick]
+    scripts/bench/shortcuts.py [--json shortcuts.json] [--carts 1024] [--seconds 60]
 
 Each group does the same work; tests show that it gives the same numbers. Carts are compiled, as in training:
 
@@ -16,14 +16,12 @@ Each group does the same work; tests show that it gives the same numbers. Carts 
 A time is the processor time of the fastest of many calls, in which the rows take turns, with one thread.
 """
 
-import argparse
-import json
 import time
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import torch
+from common import option_parser, write_json
 from environment import Step, stepper
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
@@ -49,9 +47,9 @@ CHUNK, EPSILON, BATCH = 8, 0.1, 512
 Pair = dict[str, Step]  # TorchRL's part first
 
 
-def environment(carts: int, compiled: bool) -> CartPoleEnv:
+def environment(carts: int) -> CartPoleEnv:
     """The swing-up on `carts` randomized carts."""
-    return simulated_environment("swingup", carts, "wide", compiled)
+    return simulated_environment("swingup", carts, "wide", compiled=True)
 
 
 def make_agent(env: CartPoleEnv) -> QAgent:
@@ -60,12 +58,12 @@ def make_agent(env: CartPoleEnv) -> QAgent:
     return QAgent(AgentSettings(**choice("agent/dqn")).at(0.02), signs, len(env.hardware.motors))
 
 
-def steps(carts: int, compiled: bool) -> Pair:
+def steps(carts: int) -> Pair:
     """One step with resets, under random actions."""
-    ours, parts = environment(carts, compiled), environment(carts, compiled).hardware
+    ours, parts = environment(carts), environment(carts).hardware
     settings = parts.task, parts.observation_settings, parts.reward
-    hardware = HardwareTransform(parts.motors.tolist(), *settings, compiled=compiled)
-    stock = TransformedEnv(environment(carts, compiled).plant, hardware)
+    hardware = HardwareTransform(parts.motors.tolist(), *settings, compiled=True)
+    stock = TransformedEnv(environment(carts).plant, hardware)
     actions = torch.randint(len(parts.motors), (16, carts))
     return {
         "TransformedEnv, step": stepper(stock, stock.reset(), actions),
@@ -73,9 +71,9 @@ def steps(carts: int, compiled: bool) -> Pair:
     }
 
 
-def make_training(carts: int, compiled: bool) -> Training:
+def make_training(carts: int) -> Training:
     """A training of the default settings that explores with EPSILON from the start."""
-    env = environment(carts, compiled)
+    env = environment(carts)
     epsilon = {"warmup_transitions": 0, "epsilon": (EPSILON, EPSILON)}
     learning = choice("learning/fast") | epsilon | {"carts": carts, "chunk": CHUNK}
     buffer, optimizer = choice("buffer/prioritized"), choice("optimizer/adam")
@@ -83,10 +81,10 @@ def make_training(carts: int, compiled: bool) -> Training:
     return Training(*settings, make_agent(env), env, list, None, seed=0)  # type: ignore[arg-type]
 
 
-def collections(training: Training, compiled: bool) -> Pair:
+def collections(training: Training) -> Pair:
     """A chunk of CHUNK periods, added to a buffer as n-step transitions."""
     carts, n = training.settings.carts, training.settings.steps
-    env = environment(carts, compiled)
+    env = environment(carts)
     explore = EGreedyModule(env.action_spec_unbatched, eps_init=EPSILON, eps_end=EPSILON)
     policy = TensorDictSequential(training.agent.actor, explore)
     stock = iter(Collector(env, policy, frames_per_batch=CHUNK * carts))
@@ -98,20 +96,20 @@ def collections(training: Training, compiled: bool) -> Pair:
     }
 
 
-def choices(agent: QAgent, size: int, compiled: bool) -> Pair:
+def choices(agent: QAgent, size: int) -> Pair:
     """The greedy action of one cart for an observation of `size` numbers."""
     policy = agent.greedy_policy()
     present = TensorDict({"observation": torch.randn(1, size)}, [1])
     ways = {
         "QValueActor": policy,
-        "QValueActor, torch.compile": torch.compile(policy, disable=not compiled),
+        "QValueActor, torch.compile": torch.compile(policy),
         "DrivingPolicy, traced": DrivingPolicy(policy),
-        "DrivingPolicy": DrivingPolicy(policy, compiled),
+        "DrivingPolicy": DrivingPolicy(policy, compiled=True),
     }
     return {name: partial(torch.no_grad()(way), present) for name, way in ways.items()}
 
 
-def gradients(training: Training, chunk: TensorDict, compiled: bool) -> Pair:
+def gradients(training: Training, chunk: TensorDict) -> Pair:
     """The clipped gradient of the loss of BATCH transitions."""
     loss, max_norm = training.agent.loss, training.optimizer_settings.max_grad_norm
     batch, weights = n_step_transitions(chunk, 5, 0.99)[:BATCH], list(training.agent.loss.parameters())
@@ -125,9 +123,9 @@ def gradients(training: Training, chunk: TensorDict, compiled: bool) -> Pair:
     columns = plain.columns(batch)
     return {
         "loss.backward": partial(stock, loss),
-        "loss.backward, torch.compile": partial(stock, torch.compile(loss, disable=not compiled)),
+        "loss.backward, torch.compile": partial(stock, torch.compile(loss)),
         "LossGradient, not compiled": partial(plain, columns),
-        "LossGradient": partial(LossGradient(loss, LEARNED, max_norm, compiled), columns),
+        "LossGradient": partial(LossGradient(loss, LEARNED, max_norm, compiled=True), columns),
     }
 
 
@@ -139,15 +137,15 @@ def seconds(call: Step) -> float:
     return time.thread_time() - started
 
 
-def measure(carts: int, budget: float, compiled: bool) -> list[dict[str, Any]]:
+def measure(carts: int, budget: float) -> list[dict[str, Any]]:
     """Return the milliseconds per call of each variant, and its speed-up over TorchRL."""
-    training = make_training(carts, compiled)
+    training = make_training(carts)
     chunk = training.collect()
     pairs = [
-        steps(carts, compiled),
-        collections(training, compiled),
-        choices(training.agent, chunk["observation"].shape[-1], compiled),
-        gradients(training, chunk, compiled),
+        steps(carts),
+        collections(training),
+        choices(training.agent, chunk["observation"].shape[-1]),
+        gradients(training, chunk),
     ]
     calls = {name: call for pair in pairs for name, call in pair.items()}
     best = dict.fromkeys(calls, float("inf"))
@@ -165,18 +163,15 @@ def measure(carts: int, budget: float, compiled: bool) -> list[dict[str, Any]]:
 
 def main() -> None:
     """Measure, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the results there")
+    parser = option_parser(__doc__)
     parser.add_argument("--carts", type=int, default=1024, help="simulated in parallel (default: 1024)")
     parser.add_argument("--seconds", type=float, default=60.0, help="of rounds (default: 60)")
-    parser.add_argument("--quick", action="store_true", help="one round, not compiled: only that it runs")
     options = parser.parse_args()
     torch.manual_seed(0)
     torch.set_num_threads(1)
-    results = measure(options.carts, 0.0 if options.quick else options.seconds, not options.quick)
+    results = measure(options.carts, options.seconds)
     print(table(results, {"name": "", "ms": "ms per call", "ratio": "speed-up", "to": "as"}))
-    if options.json:
-        options.json.write_text(json.dumps(results, indent=2) + "\n")
+    write_json(options.json, results)
 
 
 if __name__ == "__main__":
