@@ -159,6 +159,7 @@ def trained_and_judged(job: Job, overrides: Mapping[str, Any]) -> dict[str, Any]
     scores = np.array([episode.score.sum() for episode in judge(DRAWN_CARTS)])
     return {
         **job._asdict(),
+        "overrides": dict(overrides),
         "score": float(scores.mean()),
         "lost_share": float((scores < LOST_SCORE).mean()),
         "seconds": round(time.perf_counter() - started, 1),
@@ -210,6 +211,8 @@ def main() -> None:
     options, words = parser.parse_known_args()
     overrides = overrides_of(words)
     known = read_json(options.json) if options.json and options.json.exists() else []
+    if any(each.get("overrides", {}) != overrides for each in known):
+        raise SystemExit(f"{options.json} was made with other overrides: use those, or another --json file")
     results = {Job(each["wider"], each["seed"], each["informed"]): each for each in known}
     asked = [Job(w, s, i) for w in options.wider for s in range(options.seeds) for i in (False, True)]
     with processes(options.jobs) as pool:

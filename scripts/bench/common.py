@@ -16,11 +16,13 @@ import yaml
 
 from cartpole_rl.files import write_text
 from cartpole_rl.reporting.texts import Cell, table
+from cartpole_rl.run_folder import AGENT_HASH, file_hash, find_agent, recorded_provenance
 from cartpole_rl.workflows.build import use_threads
 
 RUNS = Path("runs/bench")  # the parent of every run folder that a bench script makes
 REFERENCES = Path(__file__).with_name("references.json")  # written by reference.py
 FIRST_SEED = 10  # of reported trainings; settings were chosen on seeds 0 to 9
+AGENT = "run="  # the setting that names an agent
 LOST_SCORE = 500  # an episode with a lower score counts as lost
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -89,12 +91,28 @@ def failure(command: str, *words: str) -> str | None:
     return (done.stderr.strip().splitlines() or [f"exit status {done.returncode}"])[-1]
 
 
-def run_once(folder: Path, command: str, *words: str, result: str = "metrics.json") -> Path:
-    """Run cartpole-`command` in `folder` unless its `result` file exists; exit if the command fails."""
+def refusal(folder: Path, command: str, *words: str, result: str) -> str | None:
+    """Run cartpole-`command` in `folder` unless its `result` file exists; return its error, if it fails.
+
+    Exit if the result was made with other words or of another agent: it would be reported as that of these.
+    """
+    asked = [*words, f"hydra.run.dir={folder}"]
     if not (folder / result).exists():
-        error = failure(command, *words, f"hydra.run.dir={folder}")
-        if error:
-            sys.exit(f"cartpole-{command} in {folder}: {error}")
+        return failure(command, *asked)
+    made = recorded_provenance(folder)
+    if made.get("command", [])[1:] != asked:
+        sys.exit(f"{folder} was made with other settings than {' '.join(words)}; move or delete it")
+    agents = [word.removeprefix(AGENT) for word in words if word.startswith(AGENT)]
+    if (used := made.get(AGENT_HASH)) and used != file_hash(find_agent(Path(agents[0]))):
+        sys.exit(f"{folder} was made with an earlier agent of {agents[0]}; move or delete it")
+    print(f"{folder} is reused, of commit {made.get('git_commit')}", file=sys.stderr, flush=True)
+    return None
+
+
+def run_once(folder: Path, command: str, *words: str, result: str = "metrics.json") -> Path:
+    """Run cartpole-`command` in `folder` unless it was run there; exit if it fails or had other words."""
+    if error := refusal(folder, command, *words, result=result):
+        sys.exit(f"cartpole-{command} in {folder}: {error}")
     return folder
 
 

@@ -4,24 +4,23 @@
     scripts/bench/distillation.py runs/bench/medium/1[0-2] --hidden 32,32 16,16 --json students.json
 
 Distills each agent into a network of each size, in runs/bench/distilled/<agent>_<sizes>; one that exists is
-not distilled again. Words such as distillation.updates=1000 are passed to cartpole-distill as overrides.
+not distilled again, and refused if other words made it. Words such as distillation.updates=1000 are passed to
+cartpole-distill as overrides; with other ones give another --folder.
 Prints the figures of the agents, then those of the students: the mean score over 100 starts on the nominal
 simulated cart; the mean over a thousand carts of randomization=wide, and the share of them that failed
 (learning.py); memory and multiply-adds of the exported C.
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from common import RUNS, option_parser, overrides_of, positive_int, print_table, processes, write_json
+from common import RUNS, option_parser, positive_int, print_table, processes, run_once, write_json
 from learning import judge
 
 from cartpole_rl.exporting.c_code import c_files
 from cartpole_rl.workflows.build import TrainedAgent, exported_agent, trained_agent
-from cartpole_rl.workflows.config import DistillConfig, load_settings
-from cartpole_rl.workflows.distill import distill
 
 COSTS = {"table bytes": r"(\d+) bytes of tables", "multiply-adds": r"(\d+) multiply-adds"}  # in policy.h
 
@@ -29,14 +28,6 @@ COSTS = {"table bytes": r"(\d+) bytes of tables", "multiply-adds": r"(\d+) multi
 def sizes(text: str) -> tuple[int, ...]:
     """Convert `--hidden` to units of each layer."""
     return tuple(map(positive_int, text.split(",")))
-
-
-def student(teacher: Path, hidden: tuple[int, ...], parent: Path, overrides: Mapping[str, Any]) -> Path:
-    """Return the run folder of a student, distilled unless it exists."""
-    folder = parent / "_".join([teacher.name, *map(str, hidden)])
-    if not (folder / "metrics.json").exists():
-        distill(load_settings(DistillConfig, {"run": str(teacher), "hidden": hidden, **overrides}), folder)
-    return folder
 
 
 def costs(agent: TrainedAgent) -> dict[str, Any]:
@@ -49,14 +40,17 @@ def costs(agent: TrainedAgent) -> dict[str, Any]:
 
 def figures(run: Path, pole: str) -> dict[str, Any]:
     """Return the scores of an agent, and what it costs on a processor."""
-    return {"agent": run.name, **costs(trained_agent(run)), **judge(run, pole)}
+    return {"agent": run.name, **costs(trained_agent(run)), **judge(run, pole, "wide")}
 
 
 def student_figures(
-    teacher: Path, hidden: tuple[int, ...], parent: Path, overrides: Mapping[str, Any], pole: str
+    teacher: Path, hidden: tuple[int, ...], parent: Path, words: Sequence[str], pole: str
 ) -> dict[str, Any]:
-    """Distill and judge."""
-    return figures(student(teacher, hidden, parent, overrides), pole)
+    """Distill, unless it was done, and judge."""
+    units = [*map(str, hidden)]
+    folder = parent / "_".join([teacher.name, *units])
+    layers = f"hidden=[{','.join(units)}]"
+    return figures(run_once(folder, "distill", f"run={teacher}", layers, *words), pole)
 
 
 def main() -> None:
@@ -72,14 +66,11 @@ def main() -> None:
     options, words = parser.parse_known_args()
     runs = [Path(word) for word in options.runs if "=" not in word]
     words += [word for word in options.runs if "=" in word]
-    overrides = overrides_of(words)
     with processes(options.jobs) as pool:
         pending = [pool.submit(figures, run, options.pole) for run in runs]
         for hidden in options.hidden:
             for run in runs:
-                pending.append(
-                    pool.submit(student_figures, run, hidden, options.folder, overrides, options.pole)
-                )
+                pending.append(pool.submit(student_figures, run, hidden, options.folder, words, options.pole))
         results = [each.result() for each in pending]
     print_table(
         [{key: f"{value:.3g}" if key == "failed" else value for key, value in row.items()} for row in results]

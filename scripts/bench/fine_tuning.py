@@ -10,11 +10,14 @@ the same cart (reference.py --truths). An episode with a score below 500 is lost
 fine-tuning, even where `cartpole-finetune` keeps the one from before. Further words are overrides of
 cartpole-finetune.
 
-The runs are in runs/bench/fine_tuning; one that was interrupted is resumed, and one that has ended is not
-made again. `seconds` are those of the last call, so they are too few for a run that was resumed.
+The runs are in runs/bench/fine_tuning, each in a folder whose name depends on all of its settings. One that
+was interrupted is resumed, and one that has ended is not made again. `seconds` are those of the last call, so
+they are too few for a run that was resumed.
 """
 
 import argparse
+import hashlib
+import json
 import time
 from collections.abc import Sequence
 from concurrent.futures import as_completed
@@ -173,12 +176,14 @@ def parse_options() -> tuple[argparse.Namespace, dict[str, Any]]:
 def fine_tunings(
     options: argparse.Namespace, overrides: dict[str, Any]
 ) -> dict[tuple[str, int], tuple[Path, dict[str, Any]]]:
-    """Return the folder and the overrides of each fine-tuning, by agent and number of the cart."""
+    """Return the folder and the overrides of each fine-tuning, by agent and number of the cart.
+
+    Other settings have other folders, so that none is taken for that of other settings.
+    """
     work = {}
     for number, truth in enumerate(Draw(options.seed, options.wider).truths(options.truths)):
         for agent in options.agents:
             path = Path(agent)
-            names = f"{path.parent.name}_{path.name}", f"{options.seed}_{options.wider:g}_{number:02d}"
             words = {
                 "run": agent,
                 "plant": "emulated",
@@ -187,7 +192,10 @@ def fine_tunings(
                 **{f"emulator.{name}": value for name, value in truth.items()},
                 **overrides,
             }
-            work[agent, number] = PARENT.joinpath(*names), words
+            asked = hashlib.sha256(json.dumps(words, sort_keys=True).encode()).hexdigest()[:8]
+            folder = PARENT / f"{path.parent.name}_{path.name}"
+            name = f"{options.seed}_{options.wider:g}_{number:02d}_{asked}"
+            work[agent, number] = folder / name, words
     return work
 
 

@@ -11,11 +11,11 @@ import math
 from typing import Any
 
 import numpy as np
-import yaml
-from common import RUNS, failure, option_parser, print_table, read_json, write_json
+from common import RUNS, option_parser, print_table, read_json, refusal, write_json
 from truths import identification_truths, overrides, simulated_cart
 
 from cartpole_rl.identification.identify import quantities
+from cartpole_rl.run_folder import IDENTIFIED
 
 TARGETS = {  # quantity: target of the median error, and whether errors are relative to the truth
     "pole_frequency": (0.01, True),
@@ -37,13 +37,11 @@ def true_quantities(truth: dict[str, object]) -> dict[str, float]:
 def identify(number: int, truth: dict[str, object]) -> dict[str, Any] | None:
     """Return the identification.json of one cart; None if `cartpole-identify` refused."""
     folder = RUNS / "identify" / f"{number:02d}"
-    if not (folder / "identification.json").exists():
-        words = ["plant=emulated", *overrides(truth), f"emulator.seed={number}", f"hydra.run.dir={folder}"]
-        if error := failure("identify", *words):
-            print(f"cart {number}: {error}", flush=True)
-            return None
-        (folder / "truth.yaml").write_text(yaml.safe_dump(truth))
-    return read_json(folder / "identification.json")
+    words = ["plant=emulated", *overrides(truth), f"emulator.seed={number}"]
+    if error := refusal(folder, "identify", *words, result=IDENTIFIED):
+        print(f"cart {number}: {error}", flush=True)
+        return None
+    return read_json(folder / IDENTIFIED)
 
 
 def compare(found: dict[str, Any], true: dict[str, float]) -> dict[str, tuple[float, bool]]:

@@ -6,9 +6,9 @@
 
 Measures the seconds until the score reaches 0.9 of the reference. Both train on the same simulated carts
 with the same observation, reward and randomization, Stable-Baselines3 through the Gymnasium registration
-(the vector entry point), and both are judged on the nominal cart from the same 20 starts. The settings of
-Stable-Baselines3 (SETTINGS in this file) are the best of those tried by hand; ours are `cartpole-train
-experiment=medium`. One training runs at a time.
+(the vector entry point), and both are judged on the nominal cart from the same 100 hanging starts. The
+settings of Stable-Baselines3 (SETTINGS in this file) are the best of those tried by hand; ours are
+`cartpole-train experiment=medium`. One training runs at a time.
 """
 
 import json
@@ -32,10 +32,10 @@ from common import (
 )
 from tensordict import TensorDict
 
-from cartpole_rl.envs.gymnasium import simulated_environment
-from cartpole_rl.evaluation.episodes import run_batch
-from cartpole_rl.settings import evaluation_seed
+from cartpole_rl.envs.build import with_fitted_guard
 from cartpole_rl.workflows.build import use_threads
+from cartpole_rl.workflows.config import TrainConfig, load_settings
+from cartpole_rl.workflows.train import judge, nominal_env
 
 try:
     from stable_baselines3 import DQN
@@ -46,7 +46,6 @@ except ModuleNotFoundError as error:
 
 REFERENCE = reference_scores()["medium"]
 REACHED = 0.9
-STARTS = 20
 SETTINGS: dict[str, Any] = {
     "learning_rate": 1e-3,
     "buffer_size": 1_000_000,
@@ -125,10 +124,11 @@ class ManyCarts(VecEnv):
 class Judge(BaseCallback):
     """Evaluates at intervals with the clock stopped; ends the training at `REACHED` or after `limit` s."""
 
-    def __init__(self, every: int, limit: float) -> None:
+    def __init__(self, seed: int, every: int, limit: float) -> None:
         super().__init__()
-        self.every, self.limit = every, limit
-        self.env = simulated_environment("swingup", STARTS)
+        self.seed, self.every, self.limit = seed, every, limit
+        config = with_fitted_guard(load_settings(TrainConfig, {"seed": seed, "compile": False}))
+        self.env = nominal_env(config)  # that of our own evaluations
         self.history: list[dict[str, float]] = []
         self.judging, self.started, self.next = 0.0, time.perf_counter(), every
 
@@ -137,9 +137,7 @@ class Judge(BaseCallback):
             return True
         self.next += self.every
         now = time.perf_counter()
-        self.env.set_seed(evaluation_seed(0))
-        episodes = run_batch(self.env, self.policy)
-        score = float(np.mean([episode.score.sum() for episode in episodes]))
+        score = float(np.mean([each.score.sum() for each in judge(self.env, self.policy, self.seed)]))
         seconds = now - self.started - self.judging
         self.judging += time.perf_counter() - now
         self.history.append({"transitions": self.num_timesteps, "seconds": seconds, "score": score})
@@ -161,9 +159,9 @@ class Judge(BaseCallback):
 def theirs(seed: int, limit: float) -> list[dict[str, float]]:
     """Return the evaluations of a training by Stable-Baselines3."""
     model = DQN("MlpPolicy", ManyCarts(CARTS, seed), seed=seed, gradient_steps=UPDATES, **SETTINGS)
-    judge = Judge(200_000, limit)
-    model.learn(TRANSITIONS, callback=judge)
-    return judge.history
+    judging = Judge(seed, 200_000, limit)
+    model.learn(TRANSITIONS, callback=judging)
+    return judging.history
 
 
 def ours(seed: int, threads: int) -> list[dict[str, float]]:

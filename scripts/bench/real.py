@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import toolbox
 import torch
-from common import FIRST_SEED, RUNS, failure, option_parser, print_table, read_json, run_once, write_json
+from common import FIRST_SEED, RUNS, option_parser, print_table, read_json, refusal, run_once, write_json
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -166,7 +166,7 @@ def of_2020(logs: Path, home: Path) -> dict[str, Any]:
         found[name] = {"import": read_json(run / "import.json")}
         words = (f"from={run}", *RIG, f"control_period={PERIOD_2020}")
         own, step = home / f"{name}-identify", home / f"{name}-one_step"
-        if not (own / IDENTIFIED).exists() and (error := failure("identify", *words, f"hydra.run.dir={own}")):
+        if error := refusal(own, "identify", *words, result=IDENTIFIED):
             found[name]["refused"] = error
             continue
         run_once(step, "identify", *words, "method=one_step", result=IDENTIFIED)

@@ -89,9 +89,14 @@ def identified(rig: Rig, folder: Path) -> dict[str, Any]:
     return {"preflight": refused or "ready", "errors": errors, "held_out_1_s": report["held_out_1_s"]}
 
 
+def searched(file: Path) -> int:
+    """Return the states of the search in `file`; 0 if there is none."""
+    return int(read_json(file)["states"]) if file.exists() else 0
+
+
 def best_score(rig: Rig, file: Path, states: int) -> float:
-    """Return the best score of the search on the nominal cart; a search in `file` is not made again."""
-    if not file.exists():
+    """Return the best score of the search on the nominal cart; one in `file` with as many states will do."""
+    if searched(file) < states:
         config = load_settings(TrainConfig, {**rig.training, **ALONE})
         write_json(file, reference(config, states))
     return max(each["score"] for each in read_json(file)["starts"].values())
@@ -99,7 +104,7 @@ def best_score(rig: Rig, file: Path, states: int) -> float:
 
 def emulated_score(rig: Rig, file: Path, states: int) -> float:
     """Return the best score of the search with the numbers of the emulated cart, from 0 m."""
-    if not file.exists():
+    if searched(file) < states:
         cart = choice(f"cart/{rig.cart}")
         numbers = {**cart, **simulated(emulated_cart(rig), cart)}
         config = known_config(numbers, control_period=rig.period, actions=rig.actions)

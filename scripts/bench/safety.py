@@ -16,6 +16,7 @@ The brake of the firmware is no motor value of the host. A command is quoted by 
 """
 
 import json
+import math
 import os
 import random
 import select
@@ -265,11 +266,11 @@ def figures(case: Case, events: Sequence[dict[str, Any]], proxy: Proxy) -> dict[
     }
 
 
-def values_of_the_host(events: Sequence[dict[str, Any]]) -> Iterator[tuple[int, int, int]]:
+def values_of_the_host(events: Sequence[dict[str, Any]]) -> Iterator[tuple[int, float, int]]:
     """Yield (since, until, tick) of each nonzero motor value of the host, in us, from its arrival on.
 
-    It ends with the arrival of the next one, or when the firmware replaces it. A value that never came into
-    force is left out.
+    It ends with the arrival of the next one, or when the firmware replaces it; never (infinity) if neither
+    happens. A value that never came into force is left out.
     """
     in_force = 0
     for number, taken in enumerate(events):
@@ -285,6 +286,9 @@ def values_of_the_host(events: Sequence[dict[str, Any]]) -> Iterator[tuple[int, 
             if event.get("took") in ("SET_MOTOR", "STOP") or ended:
                 yield taken["us"], event["us"], taken["tick"]
                 break
+        else:
+            if began:
+                yield taken["us"], math.inf, taken["tick"]
 
 
 def summary(results: Sequence[dict[str, Any]]) -> list[dict[str, Cell]]:
@@ -315,7 +319,7 @@ def summary(results: Sequence[dict[str, Any]]) -> list[dict[str, Cell]]:
 
 
 def main() -> int:
-    """Drive all cases; return 1 if a stop was touched too fast or an old value was in force."""
+    """Drive all cases; return 1 if a stop was touched faster than LIMIT or a motor value never ended."""
     parser = option_parser(__doc__)
     parser.add_argument("--seeds", type=positive_int, default=5, help="carts for each case and firmware (5)")
     parser.add_argument("--jobs", type=positive_int, default=os.cpu_count() or 1, help="episodes at once")
@@ -336,9 +340,11 @@ def main() -> int:
     results.sort(key=lambda each: (each["case"], each["firmware"], each["seed"]))
     write_json(options.json, results)
     print_table(summary(results))
-    too_fast = [each for each in results if each["touched"] > LIMIT]
-    print(f"{len(results)} episodes; a stop was touched faster than {LIMIT} m/s in {len(too_fast)}")
-    return 1 if too_fast else 0
+    too_fast = sum(each["touched"] > LIMIT for each in results)
+    endless = sum(each["oldest_ms"] == math.inf for each in results)
+    print(f"{len(results)} episodes; a stop was touched faster than {LIMIT} m/s in {too_fast}")
+    print(f"a motor value never ended in {endless}")
+    return 1 if too_fast or endless else 0
 
 
 def drive_number(number: int, firmware: str, seed: int) -> dict[str, Any]:

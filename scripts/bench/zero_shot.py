@@ -163,16 +163,18 @@ def note_beaten(agents: list[dict[str, Any]]) -> None:
 
 
 def earlier_scores(file: Path | None, draw: dict[str, Any], count: int) -> Driven:
-    """Return the scores of the first `count` carts in the JSON file; exit if they are of another draw."""
+    """Return the scores in the JSON file; exit if it has over `count` carts, or those of another draw."""
     if file is None or not file.exists():
         return {}
     known = read_json(file)
     if others := [f"--{key} {known.get(key)}" for key in draw if known.get(key) != draw[key]]:
         raise SystemExit(f"{file} was made with {', '.join(others)}: use that, or another --json file")
-    return {
-        agent["run"]: {int(cart): scores for cart, scores in agent["scores"].items() if int(cart) < count}
-        for agent in known["agents"]
+    driven = {
+        agent["run"]: {int(cart): each for cart, each in agent["scores"].items()} for agent in known["agents"]
     }
+    if (most := max(map(max, filter(None, driven.values())), default=0) + 1) > count:
+        raise SystemExit(f"{file} holds {most} carts: use --truths {most}, or another --json file")
+    return driven
 
 
 def parse_options() -> argparse.Namespace:

@@ -1,12 +1,15 @@
 """One smoke test of each bench script: it runs, and its figures are what they say; how fast is not tested."""
 
+import argparse
 import json
+import math
 import shutil
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import adaptation
+import distillation
 import export_parity
 import fine_tuning
 import learning
@@ -16,13 +19,14 @@ import pytest
 import real
 import reference
 import reports
+import safety
 import toolbox
 import torch
 import truth_references
 import zero_shot
-from bench_scripts import Run
+from bench_scripts import TINY, Run
 from best_score.cart import KnownCart
-from common import REFERENCES, failure
+from common import REFERENCES, failure, run_once
 from tensordict import TensorDict
 from truths import REPORTED, draw_truths, simulated_cart
 
@@ -32,7 +36,7 @@ from cartpole_rl.evaluation.recordings import read_recording
 from cartpole_rl.identification.windows import Windows, history_periods
 from cartpole_rl.plants.settings import SimulatedSettings
 from cartpole_rl.randomization.ranges import Range
-from cartpole_rl.run_folder import recordings
+from cartpole_rl.run_folder import file_hash, recordings
 from cartpole_rl.tasks.rewards import UPRIGHT_ANGLE
 from cartpole_rl.workflows.build import simulated_env
 from cartpole_rl.workflows.config import TrainConfig, load_settings
@@ -58,8 +62,42 @@ def test_learning_is_judged_by_the_last_checkpoint(trained: Path, run: Run, monk
     monkeypatch.setattr(learning, "DRAWN_CARTS", 10)
     checkpoint = trained / "runs/bench/medium/10/checkpoints/last.pt"
     before = checkpoint.stat().st_mtime_ns
-    run(learning, trained, "medium", "--seeds", "1")
+    run(learning, trained, "medium", "--seeds", "1", *TINY)
     assert checkpoint.stat().st_mtime_ns == before
+    with pytest.raises(SystemExit, match="10 was made with other settings than"):
+        run(learning, trained, "medium", "--seeds", "1", *TINY, "agent.action_gap=0.8")
+
+
+def test_an_evaluation_of_an_earlier_agent_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "agent.pt").write_bytes(b"trained again")
+    (tmp_path / "metrics.json").touch()
+    words = f"run={tmp_path / 'agent.pt'}", f"hydra.run.dir={tmp_path}"
+    made = {"command": ["cartpole-evaluate", *words], "agent_sha256": file_hash(b"trained")}
+    (tmp_path / "provenance.json").write_text(json.dumps(made))
+    with pytest.raises(SystemExit, match="was made with an earlier agent of"):
+        run_once(tmp_path, "evaluate", words[0])
+    (tmp_path / "agent.pt").write_bytes(b"trained")
+    assert run_once(tmp_path, "evaluate", words[0]) == tmp_path
+
+
+def test_stock_agents_are_judged_from_our_starts() -> None:
+    pytest.importorskip("stable_baselines3")
+    import peer
+
+    env = peer.Judge(3, 1, 1.0).env
+    env.reset()
+    x, x_dot, theta, theta_dot = env.plant.true_state
+    assert len(x) == 100
+    assert x.abs().max() <= 0.1
+    assert not torch.cat((x_dot, theta_dot, theta.cos() + 1)).any()
+
+
+def test_a_distilled_agent_is_judged_as_the_others_are(monkeypatch: Any) -> None:
+    monkeypatch.setattr(learning, "STARTS", 3)
+    monkeypatch.setattr(learning, "DRAWN_CARTS", 3)
+    found = distillation.figures(Path("pretrained/medium"), "medium")
+    assert found["score"] > 4000
+    assert found["multiply-adds"] > 1000
 
 
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="gcc is missing: install a C compiler")
@@ -115,6 +153,13 @@ def test_fine_tunings_are_compared_with_the_reference_of_the_cart() -> None:
     assert (row["mean score before"], row["worst score after"]) == (3850, 1700)
     assert row["lost before, tuning, after"] == "0, 2, 1"
     assert fine_tuning.agent_row(fine_tuning.agent_figures("a", [failed]))["not tuned"] == 1
+    options = argparse.Namespace(agents=["a/b"], seed=1, wider=0.0, truths=2, episodes=5, starts=5)
+    folders = [
+        {folder for folder, _ in fine_tuning.fine_tunings(options, words).values()}
+        for words in ({}, {}, {"finetuning.iterations": 12})
+    ]
+    assert folders[0] == folders[1]
+    assert len(folders[0] | folders[2]) == 4
 
 
 def test_an_informed_agent_observes_its_own_cart() -> None:
@@ -167,6 +212,10 @@ def test_zero_shot_fractions_are_relative_to_the_reference_of_the_cart(
     assert agent["beaten"] == [0] * (max(scores) > 100)
     with pytest.raises(SystemExit, match="was made with --seed 2026: use that, or another --json file"):
         figures(run, zero_shot, trained, *words, "--seed", "0")
+    found["agents"][0]["scores"]["9"] = scores
+    (trained / "figures.json").write_text(json.dumps(found))
+    with pytest.raises(SystemExit, match="holds 10 carts: use --truths 10"):
+        figures(run, zero_shot, trained, *words)
 
 
 def within(value: float, low: float, high: float) -> bool:
@@ -189,6 +238,14 @@ def test_drawn_carts_are_possible_and_inside_the_ranges_of_training_unless_wider
             outside = {name for name in drawn & set(bounds) if not within(cart[name], *bounds[name])}
             assert not outside or wider
     assert draw_truths(REPORTED, 20)[:5] == draw_truths(REPORTED, 5)
+
+
+def test_a_motor_value_that_never_ends_is_not_left_out() -> None:
+    taken = {"us": 0, "took": "SET_MOTOR", "motor": 50, "tick": 7}
+    refused = {"us": 30_000, "took": "SET_MOTOR", "motor": 60, "tick": 8}
+    events = [taken, {"us": 1000, "in_force": 50}]
+    assert [*safety.values_of_the_host([*events, {"us": 9000, "in_force": 0}, refused])] == [(0, 9000, 7)]
+    assert [*safety.values_of_the_host(events)] == [(0, math.inf, 7)]
 
 
 def test_reports_of_more_and_more_runs_are_measured(trained: Path, run: Run) -> None:
