@@ -102,11 +102,16 @@ def refusal(folder: Path, command: str, *words: str, result: str) -> str | None:
     made = recorded_provenance(folder)
     if made.get("command", [])[1:] != asked:
         sys.exit(f"{folder} was made with other settings than {' '.join(words)}; move or delete it")
-    agents = [word.removeprefix(AGENT) for word in words if word.startswith(AGENT)]
-    if (used := made.get(AGENT_HASH)) and used != file_hash(find_agent(Path(agents[0]))):
-        sys.exit(f"{folder} was made with an earlier agent of {agents[0]}; move or delete it")
+    check_agent(folder, next((word.removeprefix(AGENT) for word in words if word.startswith(AGENT)), ""))
     print(f"{folder} is reused, of commit {made.get('git_commit')}", file=sys.stderr, flush=True)
     return None
+
+
+def check_agent(folder: Path, agent: str) -> None:
+    """Exit if the run in `folder` is of another checkpoint than its `agent` has now."""
+    used = recorded_provenance(folder).get(AGENT_HASH)
+    if used and used != file_hash(find_agent(Path(agent))):
+        sys.exit(f"{folder} was made with an earlier agent of {agent}; move or delete it")
 
 
 def run_once(folder: Path, command: str, *words: str, result: str = "metrics.json") -> Path:

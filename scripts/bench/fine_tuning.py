@@ -29,6 +29,7 @@ from common import (
     LOST_SCORE,
     RUNS,
     add_wider_option,
+    check_agent,
     option_parser,
     overrides_of,
     positive_int,
@@ -54,6 +55,7 @@ FIGURES = "bench.json"  # in a run folder, written at the end
 
 def tuned(folder: Path, overrides: dict[str, Any]) -> dict[str, Any]:
     """Fine-tune in `folder` unless it has been done, and return the figures; `error` if the cart fails."""
+    check_agent(folder, str(overrides["run"]))
     if (folder / FIGURES).exists():
         figures: dict[str, Any] = read_json(folder / FIGURES)
         return figures

@@ -76,6 +76,8 @@ def test_an_evaluation_of_an_earlier_agent_is_refused(tmp_path: Path) -> None:
     (tmp_path / "provenance.json").write_text(json.dumps(made))
     with pytest.raises(SystemExit, match="was made with an earlier agent of"):
         run_once(tmp_path, "evaluate", words[0])
+    with pytest.raises(SystemExit, match="was made with an earlier agent of"):
+        fine_tuning.tuned(tmp_path, {"run": str(tmp_path / "agent.pt")})
     (tmp_path / "agent.pt").write_bytes(b"trained")
     assert run_once(tmp_path, "evaluate", words[0]) == tmp_path
 
