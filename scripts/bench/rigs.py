@@ -5,10 +5,11 @@
 
 For each rig: preflight and identification on an emulated cart, then for each seed a training, an evaluation
 of the last checkpoint on the nominal cart and on the emulated one, its C export driving on the emulated
-board, a fine-tuning, and a training on the identification, evaluated on the emulated cart. The emulated cart differs from the rig's file as the default one from ip02. A
-fraction is a score over the best one that reference.py finds with the same settings: on the rig's nominal
-cart from any of its starts, and on a simulated cart with the numbers of the emulated one. The runs are in
-runs/bench/rigs; what exists is not made again.
+board, a fine-tuning, and a training on the identification with an evaluation on the emulated cart. That cart
+differs from the rig's file as the default one from ip02. A fraction is a score over the best one that
+reference.py finds with the same settings: on the rig's nominal cart from any of its starts, and on a
+simulated cart with the numbers of the emulated one. The runs are in runs/bench/rigs; what exists is not made
+again.
 """
 
 from pathlib import Path
@@ -65,7 +66,6 @@ RIGS = (
     Rig("laboratorio", "laboratorio", 0.01, "nine_levels_fine", "dc"),
     Rig("stepper", "rod_03", 0.01, "nine_levels_fine", "stepper"),
 )
-
 POLE_FRICTION = "bearing"  # the one that cartpole-identify fits
 
 
