@@ -12,7 +12,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from cartpole_rl.checking import validated
-from cartpole_rl.choices import choice
+from cartpole_rl.choices import choice, load
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.rig.hardware import LARGEST_MOTOR, Hardware, hardware_of, nominal_hardware
 from cartpole_rl.rig.parameters import check_cart, completed
@@ -41,6 +41,7 @@ class EmulatorSettings(Settings):
     policy: Path | None = None
     port: Port = "auto"  # a pseudo-terminal or a local TCP port; auto: pty where the system has it
     hardware: Hardware | None = None  # of the cart's file, which the firmware is built with; None: ip02's
+    cart: str | None = None  # a choice or file of cart=, which this cart is like; None: that of the command
     given: tuple[str, ...] = ()  # settings that cart= does not replace: those that the user gave
     seed: Annotated[int, Field(ge=0)] = 0  # of latencies, disturbed frames, boot position, the hand's angle
 
@@ -103,11 +104,11 @@ class EmulatorSettings(Settings):
         return self
 
     def of_cart(self, cart: Mapping[str, float]) -> Self:
-        """Return the settings of a cart with the hardware and the numbers of a file.
+        """Return the settings of a cart with the hardware and the numbers of a file, or of `self.cart`.
 
         Where these settings are still those of the default cart, and not `given`, they become those of one
         that differs from the file as the default cart differs from ip02's. A file with ip02's hardware
-        changes nothing. Raises ConfigError for another rig than `hardware`.
+        changes nothing. Raises ConfigError for another rig than `hardware` or that of `self.cart`.
         """
         check_cart(cart)
         hardware, of_ip02 = hardware_of(cart), choice("cart/ip02")
@@ -115,6 +116,8 @@ class EmulatorSettings(Settings):
             return self
         if self.hardware is not None:
             raise ConfigError("emulator.hardware: it differs from the rig of cart=; leave it out, give cart=")
+        if self.cart is not None:
+            cart = self._file_with(hardware)
         numbers, default = completed({**of_ip02, **cart}), EmulatorSettings()
 
         def times(name: str, of: str = "") -> float:
@@ -158,6 +161,20 @@ class EmulatorSettings(Settings):
         }
         values = {**self.model_dump(), **changes, "hardware": hardware}
         return validated(type(self), values, lambda _: "the emulated cart of cart=: emulator.")
+
+    def _file_with(self, hardware: Hardware) -> dict[str, float]:
+        """Return the numbers of the file `cart`. Raises ConfigError if its rig is not `hardware`."""
+        try:
+            cart = load("cart", self.cart).values
+            check_cart(cart)
+        except ConfigError as error:
+            raise ConfigError(f"emulator.cart={self.cart}: {error}") from None
+        if hardware_of(cart) != hardware:
+            raise ConfigError(
+                f"emulator.cart={self.cart} has another rig than cart=; give emulator.cart=<a file with that "
+                "rig>, or emulator.cart=null"
+            )
+        return cart
 
 
 def zero_force_motor(cart: Mapping[str, float]) -> float:

@@ -27,7 +27,8 @@ from cartpole_rl.plants.serial.preparation import Confirm, StartPosition, nobody
 from cartpole_rl.plants.settings import PlantSettings
 from cartpole_rl.plants.specs import tensordict_of
 from cartpole_rl.randomization.poles import Pole, PoleSettings, check_one_pole
-from cartpole_rl.rig.hardware import Hardware, hardware_of
+from cartpole_rl.randomization.ranges import IdentifiedSettings
+from cartpole_rl.rig.hardware import Hardware, hardware_of, nominal_hardware
 from cartpole_rl.rig.parameters import check_names, completed
 from cartpole_rl.run_folder import (
     BASELINE,
@@ -272,6 +273,19 @@ def guard_note(training: TrainConfig, config: EvaluateConfig, settings: CartPole
     pole = f" to {pole_text(settings.pole)}" if "pole" in changes else ""
     return (
         f"note: the track guard of the training is for {others}; fitted anew{pole}: {settings.guard.active}"
+    )
+
+
+def identified_note(training: TrainConfig, config: EvaluateConfig) -> str | None:
+    """Return a line about the emulated cart if it is made from the numbers of an identification."""
+    emulated = config.plant.reads_emulator and config.emulator.cart is None
+    if not emulated or not isinstance(training.randomization, IdentifiedSettings):
+        return None
+    if training.hardware == nominal_hardware():
+        return None
+    return (
+        "note: the emulated cart differs from the identified one as the default cart from ip02; to drive one "
+        "that was identified, give emulator.cart=<the cart= of cartpole-identify>"
     )
 
 

@@ -49,6 +49,7 @@ from cartpole_rl.workflows.build import (
     evaluated_settings,
     exported_agent,
     guard_note,
+    identified_note,
     precedence,
     predicting_env,
     provenance,
@@ -100,7 +101,11 @@ class Evaluation:
         known, plant, poles = self.known_poles, self.config.plant, self.settings.pole
         if known and (warning := other_pole(known, poles, plant.reads_emulator)):
             print_message(command, warning)
-        if note := guard_note(self.training, self.config, self.settings):
+        notes = (
+            guard_note(self.training, self.config, self.settings),
+            identified_note(self.training, self.config),
+        )
+        for note in filter(None, notes):
             print_message(command, note)
         if not plant.is_on_port:
             note_other_numbers(command, self.settings.nominal_cart, (poles.choices or {}).values())

@@ -68,6 +68,7 @@ from cartpole_rl.workflows.build import (
     evaluated_env,
     evaluated_settings,
     guard_note,
+    identified_note,
     new_agent,
     trained_agent,
     use_threads,
@@ -122,8 +123,11 @@ def finetune(config: FinetuneConfig, folder: Path, words: Sequence[str] = ()) ->
         )
     evaluation = evaluation_config(config)
     settings = evaluated_settings(training, evaluation)
-    emulated = config.plant.reads_emulator
-    notes = other_pole(agent.known_poles, settings.pole, emulated), guard_note(training, evaluation, settings)
+    notes = (
+        other_pole(agent.known_poles, settings.pole, config.plant.reads_emulator),
+        guard_note(training, evaluation, settings),
+        identified_note(training, evaluation),
+    )
     for note in filter(None, notes):
         show(note)
     if not checkpoint:

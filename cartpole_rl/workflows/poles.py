@@ -88,10 +88,11 @@ def plant_words(
     if not plant.reads_emulator or emulator is None:
         return plant.words
     files = {name: EmulatorSettings(**file) for name, file in group_choices("emulator").items()}
-    default, pole = EmulatorSettings(), emulated_pole(emulator)
+    default, pole, cart = EmulatorSettings(), emulated_pole(emulator), emulator.cart
     if known and pole == emulated_pole(default) and not knows(known, one_pole(pole)):
-        pole = emulated_pole(files.get(emulator_for(known) or "", default))
-    driven = emulator.model_copy(update={**pole.model_dump(), "policy": None, "given": ()})
+        chosen = files.get(emulator_for(known) or "", default)
+        pole, cart = emulated_pole(chosen), chosen.cart
+    driven = emulator.model_copy(update={**pole.model_dump(), "cart": cart, "policy": None, "given": ()})
     choices = [
         [f"emulator={name}"] * bool(name) + changed_words("emulator", driven, file.model_dump())
         for name, file in {"": default, **files}.items()

@@ -226,7 +226,7 @@ def test_every_setting_is_tried_here_or_on_the_wire():
     elsewhere |= {"frame_duplication", "frame_reordering"}  # test_link.py
     elsewhere |= {"unplug_at", "stuck_encoder", "stuck_at"}  # test_faults.py
     elsewhere |= {"cogging", "cogging_pitch"}  # test_physics.py
-    elsewhere |= {"firmware", "policy", "hardware", "given"}  # test_onboard_policy.py, test_rigs.py
+    elsewhere |= {"firmware", "policy", "hardware", "given", "cart"}  # test_onboard_policy.py, test_rigs.py
     elsewhere |= {"journal", "port"}  # tests/plants/test_stops.py, tests/plants/serial/test_tcp.py
     elsewhere |= {"clock_rate", "knock"}  # below
     assert set(OTHER) | elsewhere == set(EmulatorSettings.model_fields)

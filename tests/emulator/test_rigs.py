@@ -15,6 +15,7 @@ pytest.importorskip("mujoco", reason='pip install "cartpole_rl[emulator]"')
 from driven_cart import COARSE, Driven
 from firmwares import needs_compiler
 
+from cartpole_rl.choices import choice
 from cartpole_rl.composition import compose
 from cartpole_rl.emulator.guards import FrozenCartWatch, FrozenPoleWatch
 from cartpole_rl.emulator.settings import EmulatorSettings
@@ -232,6 +233,23 @@ def test_what_was_given_stays_though_it_is_the_default(tmp_path: Path) -> None:
         ConfigError, match=r"cart.hard_pus: there is no such setting; did you mean cart.hard_push"
     ):
         EmulatorSettings().of_cart({"hard_pus": 3.0})
+
+
+def test_the_cart_that_was_identified_is_emulated(tmp_path: Path) -> None:
+    """An agent of its identification has other numbers on the same rig."""
+    file = choice("cart/sensorsini")
+    identified = {**file, "cart_viscous": 1.3 * file["cart_viscous"], "latency": 0.0}
+    (tmp_path / "mine.yaml").write_text("defaults: [sensorsini]\n")
+    emulator = EmulatorSettings(**choice("emulator/sensorsini"))
+    truth = emulator.of_cart(file)
+    for cart in ("sensorsini", f"{tmp_path}/mine.yaml"):
+        same = emulator.model_copy(update={"cart": cart}).of_cart(identified)
+        assert same == truth.model_copy(update={"cart": cart})
+    assert EmulatorSettings().of_cart(identified).cart_viscous == pytest.approx(1.3 * truth.cart_viscous)
+    with pytest.raises(ConfigError, match=r"^emulator\.cart=sensorsini has another rig than cart=; give"):
+        emulator.of_cart(choice("cart/stepper"))
+    with pytest.raises(ConfigError, match=r"^emulator\.cart=.*there is no such file"):
+        EmulatorSettings(cart="other.yaml").of_cart(file)
 
 
 def test_another_rig_than_the_given_one_is_refused() -> None:

@@ -17,6 +17,8 @@ from cartpole_rl.physics.models import Models
 from cartpole_rl.randomization.poles import Pole
 from cartpole_rl.rig.hardware import nominal_hardware
 from cartpole_rl.rig.parameters import POSITIVE, Parameter, factor
+from cartpole_rl.workflows.build import identified_note
+from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig, load_settings
 from cartpole_rl.workflows.identify import errors, friction_choice, write_choices
 
 HARDWARE = nominal_hardware().model_copy(update={"track_span": 0.5, "pole_counts_per_turn": 2400})
@@ -57,6 +59,24 @@ def test_a_law_of_a_user_has_a_file_with_the_parameters_that_it_brings(
     assert shlex.split(friction_choice(models.cart_friction, Path("my id"))) == [
         'cart_friction="my id/cart_friction.yaml"'
     ]
+
+
+@pytest.mark.parametrize(("counts", "noted"), [(2400, True), (4096, False)])
+def test_that_an_emulated_cart_is_made_from_identified_numbers_is_noted(
+    counts: int, noted: bool, nominal: dict[str, float], tmp_path: Path
+) -> None:
+    """Not on ip02's rig, where it has numbers of its own."""
+    write(Models(), nominal, tmp_path)
+    rig = {**nominal_hardware().model_dump(), "pole_counts_per_turn": counts}
+    files = {name: tmp_path / f"{name}.yaml" for name in ("pole", "randomization")}
+    cart = yaml.safe_load((tmp_path / "cart.yaml").read_text()) | rig
+    training = load_settings(TrainConfig, {"cart": cart, **files})
+
+    def note(**given: str) -> str | None:
+        return identified_note(training, load_settings(EvaluateConfig, {"run": "any", **given}))
+
+    assert ("give emulator.cart=" in (note(plant="emulated") or "")) == noted
+    assert note(plant="simulated") is note(plant="emulated", emulator="sensorsini") is None
 
 
 TRUTH = EmulatorSettings(
