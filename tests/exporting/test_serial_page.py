@@ -207,6 +207,29 @@ def test_a_hidden_page_stops_a_cart_on_a_bad_line(page: str, tmp_path: Path) -> 
 
 
 @needs_browser
+def test_a_port_that_never_closes_or_is_in_use_leaves_the_reader_a_way_on(page: str, tmp_path: Path) -> None:
+    script = """
+    port.close = () => new Promise(() => {});
+    element("connect").click();
+    await until(() => real?.asking || real?.done);
+    element("stop").click();
+    await until(() => real.done);
+    drawSerial();
+    const first = real, canConnect = shown("connect");
+    port.open = async () => { throw new DOMException("Failed to open serial port.", "NetworkError"); };
+    element("connect").click();
+    await until(() => real !== first && real.done);
+    report([[first.line, canConnect, real.line], 0, 0]);
+    """
+    (ended, can_connect, refused), _ = answer(page, script, tmp_path)
+    assert ended == "Stopped by hand."
+    assert can_connect
+    assert refused == (
+        "Failed to open serial port. End other programs and pages that use the port, or reload this page."
+    )
+
+
+@needs_browser
 def test_a_cart_of_another_rig_is_refused(page: str, tmp_path: Path) -> None:
     other = nominal_hardware().model_copy(update={"pole_counts_per_turn": 4000, "right_switch": 1})
     line, bridge = answer(page, AGREED + ENDED, tmp_path, hardware=other.model_dump())

@@ -1,6 +1,7 @@
 const WIRE = DATA.wire; // the protocol, the rules of a host, and what the agent's cart has to report
 const SIZES = { B: [1, "Uint8"], H: [2, "Uint16"], h: [2, "Int16"], I: [4, "Uint32"], i: [4, "Int32"] };
 const NAMES = Object.fromEntries(Object.entries(WIRE.messages).map(([name, { type }]) => [type, name]));
+const LONGEST_CLOSE = 5000; // ms
 const LOST = "the cable to the cart was pulled, or the cart lost its power";
 
 // frames, as docs/protocol.md describes them
@@ -100,7 +101,7 @@ function isNewer(sequence, than) {
 }
 
 function sentence(words) {
-  return `${words[0].toUpperCase()}${words.slice(1)}${words.endsWith(".") ? "" : "."}`;
+  return `${words[0].toUpperCase()}${words.slice(1)}${/[.?]$/.test(words) ? "" : "."}`;
 }
 
 /** A cart at a port of Web Serial, from the handshake to the end of one episode, whose end is always a STOP. */
@@ -164,7 +165,9 @@ class SerialCart {
   // bytes
 
   async open() {
-    await this.port.open({ baudRate: WIRE.baud, bufferSize: 4096 });
+    await this.port.open({ baudRate: WIRE.baud, bufferSize: 4096 }).catch(({ message }) => {
+      throw new Error(`${message} End other programs and pages that use the port, or reload this page.`);
+    });
     this.writer = this.port.writable.getWriter();
     this.reading = this.read();
     const low = { dataTerminalReady: false, requestToSend: false }; // a rise may restart the board
@@ -207,8 +210,14 @@ class SerialCart {
     this.end(this.writer ? "the port took no bytes: check its cable, then connect again" : LOST);
   }
 
+  /** Give the port back. A browser can wait without end for a device that takes no bytes. */
   async close() {
     this.closed = true;
+    const closed = this.giveBack();
+    await Promise.race([closed, new Promise((resolve) => setTimeout(resolve, LONGEST_CLOSE))]);
+  }
+
+  async giveBack() {
     await this.reader?.cancel().catch(() => {});
     await this.reading;
     this.writer?.releaseLock();
