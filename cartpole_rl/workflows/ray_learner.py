@@ -15,6 +15,7 @@ import platform
 import secrets
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import threading
@@ -62,6 +63,7 @@ PERIOD = 0.2  # s between two calls of the learner
 PAUSE = 5.0  # s before the process is started again
 GIVE_UP = 45.0  # s without an answer, after which it is started again: Ray may have given up this node
 GRACE = 15.0  # s from the request to end to SIGKILL
+STUCK = 10  # s in which the next part of a message has to arrive; longer than PAUSE
 
 Episodes = Callable[[int], list[Episode]]  # those on disk, from a number on
 
@@ -231,8 +233,9 @@ class LearnerLink:
         try:
             while self._pipe.poll():
                 self._receive(self._pipe.recv())
-        except (EOFError, OSError):  # also in the middle of a message
-            self._lose(self._ending or "its process on this machine ended")
+        except (EOFError, OSError) as error:  # also in the middle of a message
+            ended = "hangs" if isinstance(error, BlockingIOError) else "ended"
+            self._lose(self._ending or f"its process on this machine {ended}")
             if time.monotonic() - self._started > PAUSE:
                 self._restart()
             return
@@ -280,7 +283,7 @@ class LearnerLink:
 
     def _start(self) -> None:
         context = multiprocessing.get_context("spawn")
-        self._pipe, theirs = context.Pipe()
+        self._pipe, theirs = impatient(context.Pipe())
         self._answered = context.Value("d", 0.0, lock=False)  # time of the last answer; 0: none yet
         work = theirs, self._answered, self.settings, self.episodes, self.make_task(), self._taken
         self._process = context.Process(target=Link(*work).run, args=(self.folder / LOG, os.getpid()))
@@ -288,6 +291,13 @@ class LearnerLink:
         theirs.close()
         self._started = self._listens_since = self._read_at = time.monotonic()
         self._ending = None
+
+
+def impatient(pipe: tuple[Connection, Connection]) -> tuple[Connection, Connection]:
+    """Return a pipe whose first end raises BlockingIOError if a message stops arriving for STUCK s."""
+    with socket.socket(fileno=os.dup(pipe[0].fileno())) as end:
+        end.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("ll", STUCK, 0))
+    return pipe
 
 
 @dataclass

@@ -236,7 +236,7 @@ class PipedLink(LearnerLink):
     first: Any = None
 
     def _start(self) -> None:
-        self._pipe, end = Pipe()
+        self._pipe, end = ray_learner.impatient(Pipe())
         self._process = SimpleNamespace(join=lambda timeout=None: None, kill=lambda: None)
         self._answered = SimpleNamespace(value=0.0 if self.first else time.monotonic())
         self._started = self._read_at = self._listens_since = time.monotonic()
@@ -326,6 +326,19 @@ def test_the_reason_of_a_process_that_ends_is_shown_and_it_is_started_again(
     link.poll()
     assert len(link.ends) == 2
     assert not link.is_lost
+
+
+def test_a_process_that_hangs_amid_a_message_is_started_again(
+    shown: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ray_learner, "STUCK", 1)
+    monkeypatch.setattr(ray_learner, "PAUSE", 0.0)
+    link = new_link(shown)
+    link.connect()
+    os.write(link.ends[0].fileno(), CUT)
+    link.poll()
+    assert shown[-1] == "the learner is lost: its process on this machine hangs"
+    assert len(link.ends) == 2
 
 
 def test_a_learning_that_failed_ends_the_session(link: PipedLink) -> None:
