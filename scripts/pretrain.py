@@ -29,7 +29,8 @@ def main() -> None:
     parser.add_argument("run", type=Path, help="run folder of the training, or a checkpoint in it")
     options = parser.parse_args()
     folder = PACKAGE / PRETRAINED / options.name
-    agent, origin = load_agent(options.run), provenance(options.run)
+    agent = load_agent(options.run)
+    origin = provenance(options.run, agent)
     if find_agent(options.run).stat().st_size > LARGEST:
         parser.error(f"{options.run}: its checkpoint is larger than {LARGEST} bytes")
     origin["command"] = [word for word in origin["command"] if not word.startswith("hydra.run.dir=")]

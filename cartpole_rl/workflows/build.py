@@ -64,11 +64,16 @@ def new_agent(config: TrainConfig, device: str = "cpu") -> QAgent:
 
 @dataclass(frozen=True)
 class TrainedAgent:
-    """A policy, the settings that it was trained with, and its `known_poles`, the newest last."""
+    """A policy, the settings that it was trained with, and its `known_poles`, the newest last.
+
+    `transitions` and `score` are those of its checkpoint.
+    """
 
     training: TrainConfig
     policy: Policy
     known_poles: Sequence[PoleSettings] = ()
+    transitions: int = 0
+    score: float | None = None
 
 
 def trained_agent(run: Path) -> TrainedAgent:
@@ -79,7 +84,8 @@ def trained_agent(run: Path) -> TrainedAgent:
     agent = new_agent(training)
     restore_weights(agent, checkpoint.weights, f"run={run}")
     agent.eval()
-    return TrainedAgent(training, agent.greedy_policy(), known_poles(training, checkpoint))
+    poles = known_poles(training, checkpoint)
+    return TrainedAgent(training, agent.greedy_policy(), poles, checkpoint.transitions, checkpoint.score)
 
 
 def known_poles(training: TrainConfig, checkpoint: AgentCheckpoint) -> list[PoleSettings]:
@@ -197,10 +203,10 @@ def network_of(trained: TrainedAgent) -> Any:
     return network
 
 
-def provenance(run: Path) -> dict[str, Any]:
-    """Return the origin of the agent of `run`: its command, versions, commit, transitions and score."""
-    checkpoint, agent = load_agent(run), find_agent(run)
-    recorded = recorded_provenance(agent.parent.parent if agent.parent.name == CHECKPOINTS else agent.parent)
+def provenance(run: Path, agent: TrainedAgent | AgentCheckpoint) -> dict[str, Any]:
+    """Return the origin of the `agent` of `run`: its command, versions, commit, transitions and score."""
+    folder = find_agent(run).parent
+    recorded = recorded_provenance(folder.parent if folder.name == CHECKPOINTS else folder)
     try:
         canonical_json(recorded)
     except ValueError:  # an infinite number
@@ -210,7 +216,7 @@ def provenance(run: Path) -> dict[str, Any]:
             command = [Path(program).name, *arguments]
         case _:
             command = []
-    return {**recorded, "command": command, "transitions": checkpoint.transitions, "score": checkpoint.score}
+    return {**recorded, "command": command, "transitions": agent.transitions, "score": agent.score}
 
 
 def recorded_cart(recordings: Sequence[Path]) -> CartPoleSettings | None:

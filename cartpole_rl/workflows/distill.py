@@ -50,7 +50,7 @@ def distill(config: DistillConfig, folder: Path) -> float:
     student = new_agent(training)
     carts, start = config.distillation.carts, training.task.start
     env = simulated_env(training, training.plant, carts, start, config.seed)
-    settings, origin = training.model_dump(mode="json"), provenance(config.run)
+    settings, origin = training.model_dump(mode="json"), provenance(config.run, teacher)
     content = {**config.model_dump(mode="json"), "student": settings, "teacher": origin}
     write_config(folder, "distill", content)
     assert isinstance(teacher.policy, nn.Module)

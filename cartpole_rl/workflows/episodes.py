@@ -205,7 +205,7 @@ def on_the_board(
         yield config
         return
     evaluated = agent_on_board(config, trained, settings)
-    files = c_files(exported_agent(evaluated, provenance(config.run)), evaluated.training)
+    files = c_files(exported_agent(evaluated, provenance(config.run, trained)), evaluated.training)
     with tempfile.TemporaryDirectory() as folder:
         for name, text in files.items():
             Path(folder, name).write_text(text, encoding="utf-8")

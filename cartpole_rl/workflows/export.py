@@ -51,7 +51,7 @@ def export(config: ExportConfig, folder: Path, words: Sequence[str] = ()) -> Non
         write_rig(config, folder, words)
         return
     trained = trained_agent(config.run)
-    agent = exported_agent(trained, provenance(config.run))
+    agent = exported_agent(trained, provenance(config.run, trained))
     contents = files_of(config.format, agent, trained)
     write_config(folder, "export", {**config.model_dump(mode="json"), "seed": None})
     for name, content in contents.items():

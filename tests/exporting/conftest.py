@@ -22,7 +22,7 @@ def medium_agent() -> TrainedAgent:
 
 @pytest.fixture(scope="session")
 def exported(medium_agent: TrainedAgent) -> ExportedAgent:
-    return exported_agent(medium_agent, provenance(MEDIUM))
+    return exported_agent(medium_agent, provenance(MEDIUM, medium_agent))
 
 
 @pytest.fixture(scope="session")

@@ -9,6 +9,7 @@ import shutil
 import zipfile
 from collections import defaultdict, deque
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,9 +32,18 @@ from cartpole_rl.exporting.agent import (
     read_agent,
 )
 from cartpole_rl.learning.agent import QAgent
+from cartpole_rl.learning.checkpoints import load_agent, save_agent
 from cartpole_rl.tasks.features import Quantity
-from cartpole_rl.workflows.build import TrainedAgent, exported_agent, network_of, new_agent, provenance
-from cartpole_rl.workflows.config import TrainConfig, load_settings
+from cartpole_rl.workflows.build import (
+    TrainedAgent,
+    exported_agent,
+    network_of,
+    new_agent,
+    provenance,
+    trained_agent,
+)
+from cartpole_rl.workflows.config import ExportConfig, TrainConfig, load_settings
+from cartpole_rl.workflows.export import export
 from examples.drive_without_torch import action_values
 
 Change = Callable[[dict[str, bytes]], object]  # of the members of a file
@@ -170,9 +180,26 @@ def test_a_weight_that_is_not_finite_is_refused_for_every_format(medium_agent: T
 def test_a_damaged_provenance_is_left_out(text: str, medium_agent: TrainedAgent, tmp_path: Path) -> None:
     shutil.copy("cartpole_rl/pretrained/medium/agent.pt", tmp_path)
     (tmp_path / "provenance.json").write_text(text, encoding="latin-1")
-    agent = exported_agent(medium_agent, provenance(tmp_path / "agent.pt"))
+    agent = exported_agent(medium_agent, provenance(tmp_path / "agent.pt", medium_agent))
     assert agent.description.origin == "unknown"
     assert len(agent.checksum) == 64
+
+
+def test_the_provenance_is_that_of_the_exported_weights(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Their training goes on, and replaces its checkpoint."""
+    medium, run = load_agent(Path("pretrained/medium")), tmp_path / "agent.pt"
+    save_agent(run, replace(medium, transitions=10))
+
+    def read(given: Path) -> TrainedAgent:
+        agent = trained_agent(given)
+        save_agent(run, replace(medium, transitions=20))
+        return agent
+
+    monkeypatch.setattr("cartpole_rl.workflows.export.trained_agent", read)
+    export(load_settings(ExportConfig, {"format": "weights", "run": str(run)}), tmp_path / "run")
+    assert read_agent(tmp_path / "run/agent.npz").description.provenance["transitions"] == 10
 
 
 @pytest.fixture
