@@ -4,10 +4,12 @@
 """
 
 import json
+import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -154,7 +156,7 @@ def prepared(config: EvaluateConfig) -> Evaluation:
     drives = config.drives_on_board
     on_board = exported_agent(agent_on_board(config, agent, settings), {}) if drives else None
     with on_the_board(config, agent, settings) as equipped:
-        env = evaluated_env(settings, equipped, prompt=tqdm.write, confirm=confirm)
+        env = evaluated_env(settings, equipped, partial(tqdm.write, file=sys.stderr), confirm)
     return Evaluation(
         config,
         settings,

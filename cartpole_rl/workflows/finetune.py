@@ -218,7 +218,7 @@ def driven_env(
     settings: CartPoleSettings, evaluation: EvaluateConfig, memory: Memory | None, confirm: Confirm
 ) -> CartPoleEnv:
     """Return the environment over the cart, in the process that drives it."""
-    return followed(evaluated_env(settings, evaluation, print, confirm), memory)
+    return followed(evaluated_env(settings, evaluation, show, confirm), memory)
 
 
 def greedy_network(training: TrainConfig) -> nn.Module:

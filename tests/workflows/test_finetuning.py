@@ -27,13 +27,21 @@ from cartpole_rl.physics.models import Models
 from cartpole_rl.physics.parameters import CartParameters
 from cartpole_rl.physics.residual import Residual
 from cartpole_rl.plants.learned import LearnedModel, save_model
+from cartpole_rl.plants.serial.preparation import nobody
 from cartpole_rl.plants.serial.tracking import LinkStatistics
 from cartpole_rl.reporting.tensorboard import TensorBoardLog, scalars
 from cartpole_rl.run_folder import file_hash, recorded_provenance, write_config
 from cartpole_rl.tasks.episode import Episode
 from cartpole_rl.workflows.build import evaluated_settings, new_agent
-from cartpole_rl.workflows.config import FinetuneConfig, TrainConfig, load_settings, recorded_settings
-from cartpole_rl.workflows.finetune import evaluation_config, finetune, overlaid, started_from
+from cartpole_rl.workflows.config import (
+    EvaluateConfig,
+    FinetuneConfig,
+    TrainConfig,
+    load_settings,
+    recorded_settings,
+)
+from cartpole_rl.workflows.episodes import prepared
+from cartpole_rl.workflows.finetune import driven_env, evaluation_config, finetune, overlaid, started_from
 from cartpole_rl.workflows.finetuning_cart import FinetuningCart, FinetuningFiles, Stage
 from cartpole_rl.workflows.finetuning_learner import (
     CartLearner,
@@ -246,6 +254,19 @@ def test_the_agent_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr("cartpole_rl.workflows.finetune.write_config", write_and_train)
     monkeypatch.setattr("cartpole_rl.workflows.finetune.drive_all", check)
     finetune(load_settings(FinetuneConfig, CONFIG | {"run": str(run)}), folder)
+
+
+def test_what_a_person_has_to_do_is_shown_at_once(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A pipe behind standard output, such as tee, gets its text only at the end."""
+    for module in ("finetune", "episodes"):
+        name = f"cartpole_rl.workflows.{module}.evaluated_env"
+        monkeypatch.setattr(name, lambda settings, config, prompt, confirm: prompt("Hold the pole"))
+    config: Any = None
+    driven_env(config, config, None, nobody)
+    prepared(load_settings(EvaluateConfig, {"run": "lqr"}))
+    assert capsys.readouterr() == ("", "cartpole-finetune: Hold the pole\nHold the pole\n")
 
 
 def test_learning_in_simulation_follows_the_settings() -> None:
