@@ -21,6 +21,10 @@ class RefusedError(PlantError):
         self.reason = reason
 
 
+class LateError(LinkError):
+    """The cart refused a motor value that came too late. The link works."""
+
+
 class NotReadyError(PlantError):
     """A check or a move failed: `found` says what is wrong, `remedy` what to do."""
 
@@ -64,7 +68,7 @@ FAULTS: dict[Fault, str] = {
 
 
 def refusal(nack: Nack) -> PlantError:
-    """Return the error for a NACK: FaultError for a latched fault, LinkError for delay, else RefusedError."""
+    """Return the error for a NACK: FaultError for a latched fault, LateError for delay, else RefusedError."""
     known = nack.type in MessageType.__members__.values()
     what = MessageType(nack.type).name if known else f"message {nack.type:#04x}"
     why = REASONS.get(nack.reason, f"reason {nack.reason}, unknown here")
@@ -74,7 +78,7 @@ def refusal(nack: Nack) -> PlantError:
     if nack.reason == Reason.FAULT_LATCHED:
         return FaultError(text)
     if nack.reason == Reason.STALE:
-        return LinkError(text)
+        return LateError(text)
     return RefusedError(text, Reason(nack.reason) if nack.reason in REASONS else nack.reason)
 
 

@@ -13,7 +13,7 @@ from typing import Literal
 
 from cartpole_rl.errors import FaultError, LinkError, PlantError
 from cartpole_rl.plants.serial.cart import RESTARTED, SerialCart
-from cartpole_rl.plants.serial.errors import fault_words
+from cartpole_rl.plants.serial.errors import LateError, fault_words
 from cartpole_rl.plants.serial.link import now
 from cartpole_rl.plants.serial.moves import recentre
 from cartpole_rl.plants.settings import BoardSettings
@@ -181,9 +181,9 @@ class Preparation:
             return False
         try:
             recentre(self._cart, self._hanging)
-        except LinkError:
-            raise
         except PlantError as error:
+            if isinstance(error, LinkError) and not isinstance(error, LateError):
+                raise
             LOGGER.warning("homing, as the cart could not be brought back to the middle: %s", error)
             self._clear_faults()
             return False

@@ -20,7 +20,7 @@ from cartpole_rl.plants.serial.moves import recentre
 from cartpole_rl.plants.serial.plant import SerialPlant, emulated_plant
 from cartpole_rl.plants.settings import SerialSettings
 from cartpole_rl.wire.frames import Frame
-from cartpole_rl.wire.messages import Fault, Flags
+from cartpole_rl.wire.messages import Fault, Flags, Home, Nack, Reason, SetMotor
 
 TURN = 4096
 MIDDLE = 100  # counts, 2.3 mm
@@ -261,6 +261,26 @@ class TestRefusals:
             assert not plant.reset()["done"]
             assert "homing, as the cart could not be brought back" in caplog.text
             plant.close()
+
+    def test_a_value_that_came_too_late_is_answered_by_homing(self, caplog: pytest.LogCaptureFixture) -> None:
+        """As behind a burst of states. In an episode it costs that episode, not all that follow."""
+        with CartPeer() as peer, contextlib.closing(SerialPlant(quick(peer.port))) as plant:
+            plant.reset()
+            answer = peer.answer
+
+            def refuse_once(frame: Frame) -> Iterator[bytes]:
+                if not (peer.flags & Flags.ARMED and isinstance(frame.message, SetMotor)):
+                    yield from answer(frame)
+                    return
+                peer.answer = answer
+                yield peer.encode(Nack(frame.sequence, SetMotor.TYPE, Reason.STALE))
+                yield peer.next_state()
+
+            plant.halt()
+            peer.answer = refuse_once
+            assert not plant.reset()["done"]
+            assert "could not be brought back to the middle: the cart refused SET_MOTOR" in caplog.text
+            assert len(peer.messages(Home)) == 2
 
 
 def quick(port: str) -> SerialSettings:
