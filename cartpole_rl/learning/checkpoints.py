@@ -154,9 +154,10 @@ def _content(path: Path, expected: str) -> dict[str, Any]:
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch.load raises errors of many kinds for damaged files
+        own = "; a policy of your own is run=module:name" if expected == AGENT_FORMAT else ""
         raise CheckpointError(
             f"{path} is not a checkpoint of this package, or is damaged ({type(error).__name__}); "
-            f"give one that cartpole-train wrote"
+            f"give one that cartpole-train wrote{own}"
         ) from None
     found = content.pop("format", None) if isinstance(content, dict) else None
     if found != expected:

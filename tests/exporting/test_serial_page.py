@@ -209,7 +209,8 @@ def test_a_hidden_page_stops_a_cart_on_a_bad_line(page: str, tmp_path: Path) -> 
 @needs_browser
 def test_a_port_that_never_closes_or_is_in_use_leaves_the_reader_a_way_on(page: str, tmp_path: Path) -> None:
     script = """
-    port.close = () => new Promise(() => {});
+    const close = port.close.bind(port);
+    port.close = () => close().then(() => new Promise(() => {}));
     element("connect").click();
     await until(() => real?.asking || real?.done);
     element("stop").click();
