@@ -80,7 +80,9 @@ def test_a_foreign_or_truncated_file_is_named(content: bytes | float, tmp_path: 
     whole = path.read_bytes()
     path.write_bytes(content if isinstance(content, bytes) else whole[: int(content * len(whole))])
     check_refused(load_agent, path, "is not a checkpoint of this package, or is damaged")
-    check_refused(load_agent, path, "give one that cartpole-train wrote; a policy of your own is run=module:name")
+    check_refused(
+        load_agent, path, "give one that cartpole-train wrote; a policy of your own is run=module:name"
+    )
 
 
 def test_a_torch_file_of_another_kind_is_named(tmp_path: Path) -> None:
