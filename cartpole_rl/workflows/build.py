@@ -1,6 +1,6 @@
 """Builds agents and environments: those of trainings and checkpoints, run=lqr, and a cart to evaluate on."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import reduce
@@ -45,7 +45,7 @@ from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.settings import ActionSettings, Start
 from cartpole_rl.workflows.checks import check_has_agent, simulated_carts
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig, load_settings, recorded_settings
-from cartpole_rl.workflows.poles import guard_holds, pole_text
+from cartpole_rl.workflows.poles import guard_holds, other_pole, pole_text
 
 OF_BASELINE = {"observation": "raw", "observation.past_motors": 1}
 # settings that an evaluation may replace, beside the task
@@ -268,6 +268,15 @@ def outdated(training: TrainConfig, config: EvaluateConfig) -> dict[str, Any]:
     if not guard_holds(training.pole, driven.pole):
         changes["pole"] = driven.pole
     return changes
+
+
+def driving_notes(
+    training: TrainConfig, known: Sequence[PoleSettings], config: EvaluateConfig, settings: CartPoleSettings
+) -> Iterator[str]:
+    """Yield a line for each way in which the driven cart differs from those of an agent of `known` poles."""
+    pole = other_pole(known, settings.pole, config.plant.reads_emulator) if known else None
+    notes = pole, guard_note(training, config, settings), identified_note(training, config)
+    yield from filter(None, notes)
 
 
 def guard_note(training: TrainConfig, config: EvaluateConfig, settings: CartPoleSettings) -> str | None:

@@ -46,12 +46,11 @@ from cartpole_rl.workflows.build import (
     TrainedAgent,
     check_same_rig,
     compiled_training,
+    driving_notes,
     evaluated_agent,
     evaluated_env,
     evaluated_settings,
     exported_agent,
-    guard_note,
-    identified_note,
     precedence,
     predicting_env,
     provenance,
@@ -60,7 +59,6 @@ from cartpole_rl.workflows.build import (
 )
 from cartpole_rl.workflows.checks import agent_file, note_other_numbers, simulated_carts
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig
-from cartpole_rl.workflows.poles import other_pole
 
 
 @dataclass(frozen=True)
@@ -100,17 +98,11 @@ class Evaluation:
 
     def print_notes(self, command: str) -> None:
         """Print what differs from the training, and the numbers of a simulated cart that are not nominal."""
-        known, plant, poles = self.known_poles, self.config.plant, self.settings.pole
-        if known and (warning := other_pole(known, poles, plant.reads_emulator)):
-            print_message(command, warning)
-        notes = (
-            guard_note(self.training, self.config, self.settings),
-            identified_note(self.training, self.config),
-        )
-        for note in filter(None, notes):
+        for note in driving_notes(self.training, self.known_poles, self.config, self.settings):
             print_message(command, note)
-        if not plant.is_on_port:
-            note_other_numbers(command, self.settings.nominal_cart, (poles.choices or {}).values())
+        if not self.config.plant.is_on_port:
+            poles = (self.settings.pole.choices or {}).values()
+            note_other_numbers(command, self.settings.nominal_cart, poles)
 
     def check_board(self) -> None:
         """Raise PlantError if the cart's board shall drive and has no agent, or another one."""

@@ -65,10 +65,9 @@ from cartpole_rl.terminal import (
     waiting,
 )
 from cartpole_rl.workflows.build import (
+    driving_notes,
     evaluated_env,
     evaluated_settings,
-    guard_note,
-    identified_note,
     new_agent,
     trained_agent,
     use_threads,
@@ -77,7 +76,7 @@ from cartpole_rl.workflows.checks import check_finetuning, check_resumable, chec
 from cartpole_rl.workflows.config import EvaluateConfig, FinetuneConfig, TrainConfig, recorded_settings
 from cartpole_rl.workflows.finetuning_cart import FinetuningCart, FinetuningFiles, Stage, yielding_to
 from cartpole_rl.workflows.finetuning_learner import CartLearner, TunedAgent, check_simulation, check_warmup
-from cartpole_rl.workflows.poles import other_pole, plant_words
+from cartpole_rl.workflows.poles import plant_words
 from cartpole_rl.workflows.ray_learner import LearnerLink, LearnerTask, Offer
 
 NAME = "learner"  # in a checkpoint: the name of a learner of Ray
@@ -123,12 +122,7 @@ def finetune(config: FinetuneConfig, folder: Path, words: Sequence[str] = ()) ->
         )
     evaluation = evaluation_config(config)
     settings = evaluated_settings(training, evaluation)
-    notes = (
-        other_pole(agent.known_poles, settings.pole, config.plant.reads_emulator),
-        guard_note(training, evaluation, settings),
-        identified_note(training, evaluation),
-    )
-    for note in filter(None, notes):
+    for note in driving_notes(training, agent.known_poles, evaluation, settings):
         show(note)
     if not checkpoint:
         check_warmup(config, training)
