@@ -15,6 +15,7 @@ from cartpole_rl.settings import Settings
 TAGS = re.compile(
     r"(?<=^plant)\.(simulated|emulated|serial|text|driver|learned)(?=\.|$)"
     r"|(?<=^learner)\.(local|ray)(?=\.|$)|(?<=^randomization)\.(ranges|identified)(?=\.|$)"
+    r"|(?<=^emulator\.cart)\.(str|dict\[[^]]*\])(?=\.|$)"
     r"|\.literal\[[^]]*\]$|\.constrained-float$|(?<=\.wraps)\.bool$"
 )
 NEAR = 0.8  # similarity of two names, 0 to 1, from which one is suggested for the other

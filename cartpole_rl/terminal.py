@@ -8,7 +8,7 @@ import shlex
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -87,7 +87,9 @@ def as_value(value: object) -> str:
     """Return a value for a command line, in quotes where Hydra and the shell need them."""
     if isinstance(value, list | tuple):
         return shlex.quote(f"[{','.join(map(str, value))}]")
-    text = str(value)
+    if isinstance(value, Mapping):
+        return shlex.quote(f"{{{','.join(f'{name}:{each}' for name, each in value.items())}}}")
+    text = "null" if value is None else str(value)
     return shlex.quote(text if re.fullmatch(r"[A-Za-z0-9_./:%+-]+", text) else in_quotes(text))
 
 

@@ -7,16 +7,16 @@ x, motor and angles are positive to the right; angle 0 is upright.
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from cartpole_rl.checking import validated
-from cartpole_rl.choices import choice, load
+from cartpole_rl.choices import choice, is_own_file, load
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.rig.hardware import LARGEST_MOTOR, Hardware, hardware_of, nominal_hardware
 from cartpole_rl.rig.parameters import check_cart, completed
-from cartpole_rl.settings import Fraction, NonNegative, Positive, Settings
+from cartpole_rl.settings import Finite, Fraction, NonNegative, Positive, Settings
 
 Share = Annotated[float, Field(allow_inf_nan=False, ge=0, le=0.9)]  # of frames; above it hardly one arrives
 ONBOARD = Path("onboard")  # as `policy`: the agent that is evaluated
@@ -31,6 +31,16 @@ SCALED = ("cart_mass", "cart_viscous", "pole_viscous", "pole_drag")
 ADDED = ("force_asymmetry", "motor_time_constant", "latency_jitter", "track_tilt", "angle_offset")
 
 
+def _numbers(cart: Any) -> Any:
+    """Return the numbers of a person's own file, which a run keeps when the file is changed or moved."""
+    if not is_own_file(cart):
+        return cart
+    try:
+        return load("cart", cart).values
+    except ConfigError as error:
+        raise ConfigError(f"emulator.{error}") from None
+
+
 class EmulatorSettings(Settings):
     """The settings ``emulator.*``. Raises pydantic's ValidationError for a wrong name or value."""
 
@@ -41,7 +51,8 @@ class EmulatorSettings(Settings):
     policy: Path | None = None
     port: Port = "auto"  # a pseudo-terminal or a local TCP port; auto: pty where the system has it
     hardware: Hardware | None = None  # of the cart's file, which the firmware is built with; None: ip02's
-    cart: str | None = None  # a choice or file of cart=, which this cart is like; None: that of the command
+    # a choice, or the numbers of a file, of cart=, which this cart is like; None: those of the command
+    cart: Annotated[str | dict[str, Finite] | None, BeforeValidator(_numbers)] = None
     given: tuple[str, ...] = ()  # settings that cart= does not replace: those that the user gave
     seed: Annotated[int, Field(ge=0)] = 0  # of latencies, disturbed frames, boot position, the hand's angle
 
@@ -116,9 +127,8 @@ class EmulatorSettings(Settings):
             return self
         if self.hardware is not None:
             raise ConfigError("emulator.hardware: it differs from the rig of cart=; leave it out, give cart=")
-        if self.cart is not None:
-            cart = self._file_with(hardware)
-        numbers, default = completed({**of_ip02, **cart}), EmulatorSettings()
+        numbers = completed({**of_ip02, **(self._numbers_for(hardware) or cart)})
+        default = EmulatorSettings()
 
         def times(name: str, of: str = "") -> float:
             return getattr(default, name) * numbers[of or name] / of_ip02[of or name]
@@ -162,18 +172,22 @@ class EmulatorSettings(Settings):
         values = {**self.model_dump(), **changes, "hardware": hardware}
         return validated(type(self), values, lambda _: "the emulated cart of cart=: emulator.")
 
-    def _file_with(self, hardware: Hardware) -> dict[str, float]:
-        """Return the numbers of the file `cart`. Raises ConfigError if its rig is not `hardware`."""
+    def _numbers_for(self, hardware: Hardware) -> dict[str, float]:
+        """Return the numbers of `cart`, if any. Raises ConfigError for a given one of another rig."""
         try:
             cart = load("cart", self.cart).values
             check_cart(cart)
         except ConfigError as error:
-            raise ConfigError(f"emulator.cart={self.cart}: {error}") from None
-        if hardware_of(cart) != hardware:
-            raise ConfigError(
-                f"emulator.cart={self.cart} has another rig than cart=; give emulator.cart=<a file with that "
-                "rig>, or emulator.cart=null"
-            )
+            raise ConfigError(f"emulator.cart: {error}") from None
+        rig = hardware_of(cart)
+        if rig != hardware and isinstance(self.cart, str) and "cart" not in self.given:
+            return {}  # a choice of conf/emulator/ was taken for its pole
+        for name, value in rig if cart else ():
+            if value != (other := getattr(hardware, name)):
+                raise ConfigError(
+                    f"emulator.cart: it has {name} {value:g}, but the cart of this command or of the agent's "
+                    f"training {other:g}; give the file of that cart, or emulator.cart=null"
+                )
         return cart
 
 

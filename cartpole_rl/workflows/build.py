@@ -45,7 +45,7 @@ from cartpole_rl.settings import evaluation_seed
 from cartpole_rl.tasks.settings import ActionSettings, Start
 from cartpole_rl.workflows.checks import check_has_agent, simulated_carts
 from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig, load_settings, recorded_settings
-from cartpole_rl.workflows.poles import guard_holds, other_pole, pole_text
+from cartpole_rl.workflows.poles import guard_holds, other_pole, pole_text, words_of_run
 
 OF_BASELINE = {"observation": "raw", "observation.past_motors": 1}
 # settings that an evaluation may replace, beside the task
@@ -292,11 +292,11 @@ def guard_note(training: TrainConfig, config: EvaluateConfig, settings: CartPole
 
 
 def identified_note(training: TrainConfig, config: EvaluateConfig) -> str | None:
-    """Return a line about the emulated cart if it is made from the numbers of an identification."""
-    emulated = config.plant.reads_emulator and config.emulator.cart is None
-    if not emulated or not isinstance(training.randomization, IdentifiedSettings):
+    """Return a line about the emulated cart if it is made from the numbers of an identified emulated one."""
+    emulated, drawn = config.plant.reads_emulator and config.emulator.cart is None, training.randomization
+    if not emulated or training.hardware == nominal_hardware() or not isinstance(drawn, IdentifiedSettings):
         return None
-    if training.hardware == nominal_hardware():
+    if not (words_of_run(drawn.posterior.parent) or "").startswith("plant=emulated"):
         return None
     return (
         "note: the emulated cart differs from the identified one as the default cart from ip02; to drive one "

@@ -91,7 +91,7 @@ def plant_words(
     default, pole, cart = EmulatorSettings(), emulated_pole(emulator), emulator.cart
     if known and pole == emulated_pole(default) and not knows(known, one_pole(pole)):
         chosen = files.get(emulator_for(known) or "", default)
-        pole, cart = emulated_pole(chosen), chosen.cart
+        pole, cart = emulated_pole(chosen), cart or chosen.cart
     driven = emulator.model_copy(update={**pole.model_dump(), "cart": cart, "policy": None, "given": ()})
     choices = [
         [f"emulator={name}"] * bool(name) + changed_words("emulator", driven, file.model_dump())

@@ -249,7 +249,7 @@ def agents(identify: Path, model: Path, folder: Path) -> dict[int, dict[str, Any
         plants = {
             "drawn": (cart[-1], "episodes=200"),
             "learned": ("plant=learned", f"plant.model={model}", "episodes=50"),
-            "emulated": ("plant=emulated", "emulator=sensorsini", "episodes=10"),
+            "emulated": ("plant=emulated", "emulator=sensorsini", "emulator.cart=null", "episodes=10"),
         }
         driven = {
             name: run_once(run / name, "evaluate", f"run={train}", *more) for name, more in plants.items()

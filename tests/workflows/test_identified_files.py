@@ -17,8 +17,9 @@ from cartpole_rl.physics.models import Models
 from cartpole_rl.randomization.poles import Pole
 from cartpole_rl.rig.hardware import nominal_hardware
 from cartpole_rl.rig.parameters import POSITIVE, Parameter, factor
+from cartpole_rl.run_folder import write_config
 from cartpole_rl.workflows.build import identified_note
-from cartpole_rl.workflows.config import EvaluateConfig, TrainConfig, load_settings
+from cartpole_rl.workflows.config import EvaluateConfig, IdentifyConfig, TrainConfig, load_settings
 from cartpole_rl.workflows.identify import errors, friction_choice, write_choices
 
 HARDWARE = nominal_hardware().model_copy(update={"track_span": 0.5, "pole_counts_per_turn": 2400})
@@ -61,12 +62,19 @@ def test_a_law_of_a_user_has_a_file_with_the_parameters_that_it_brings(
     ]
 
 
-@pytest.mark.parametrize(("counts", "noted"), [(2400, True), (4096, False)])
+@pytest.mark.parametrize(
+    ("counts", "plant", "noted"),
+    [(2400, "emulated", True), (2400, "serial", False), (2400, None, False), (4096, "emulated", False)],
+)
 def test_that_an_emulated_cart_is_made_from_identified_numbers_is_noted(
-    counts: int, noted: bool, nominal: dict[str, float], tmp_path: Path
+    counts: int, plant: str | None, noted: bool, nominal: dict[str, float], tmp_path: Path
 ) -> None:
-    """Not on ip02's rig, where it has numbers of its own."""
+    """Not on ip02's rig, where it has numbers of its own, nor if a real cart was identified."""
     write(Models(), nominal, tmp_path)
+    if plant:
+        port = {"plant.port": "auto"} if plant == "serial" else {}
+        config = load_settings(IdentifyConfig, {"plant": plant, **port})
+        write_config(tmp_path, "identify", config.model_dump(mode="json", by_alias=True))
     rig = {**nominal_hardware().model_dump(), "pole_counts_per_turn": counts}
     files = {name: tmp_path / f"{name}.yaml" for name in ("pole", "randomization")}
     cart = yaml.safe_load((tmp_path / "cart.yaml").read_text()) | rig

@@ -6,7 +6,9 @@ from pathlib import Path
 import pytest
 
 from cartpole_rl.choices import choice, group_choices
-from cartpole_rl.plants.settings import SerialSettings
+from cartpole_rl.emulator.settings import EmulatorSettings
+from cartpole_rl.errors import ConfigError
+from cartpole_rl.plants.settings import EmulatedSettings, SerialSettings
 from cartpole_rl.randomization.poles import Pole, PoleSettings, one_pole, pole_of_length
 from cartpole_rl.run_folder import write_config
 from cartpole_rl.workflows.build import with_shaking_pole
@@ -87,6 +89,8 @@ def test_the_words_for_a_cart_keep_its_line_speed_and_its_pole() -> None:
         "plant=emulated",
         "plant=emulated emulator=large emulator.cart_viscous=2.0",
         "plant=emulated emulator=stand_in plant.rehome=always",
+        "plant=emulated emulator=laboratorio emulator.cart=null",
+        "plant=emulated emulator=large 'emulator.cart={cart_mass:0.5,cart_viscous:2e-05}'",
         "plant=emulated emulator.clock=real 'emulator.force_curve=[0.0,0.02,-0.9]'",
         "plant=serial plant.port=COM3 plant.clear_faults=2",
     ],
@@ -105,3 +109,18 @@ def test_the_words_for_a_cart_and_for_the_cart_of_a_run_choose_the_same_cart(
     write_config(imported, "identify", {"seed": 0, "from": str(identified)})
     assert words_of_run(imported) == found
     assert words_of_run(tmp_path) is None
+
+
+@pytest.mark.parametrize("cart", [{}, choice("cart/stepper"), {"track_span": 0.7}])
+def test_the_emulated_cart_that_is_advised_for_its_pole_fits_every_rig(cart: dict[str, float]) -> None:
+    known, plant = [PoleSettings(**choice("pole/rod_03"))], EmulatedSettings(kind="emulated")
+    words = emulated_words(known)
+    assert words == plant_words(plant, EmulatorSettings(), known) == "plant=emulated emulator=rod_03"
+    given = plant_words(plant, EmulatorSettings(cart="laboratorio"), known)
+    assert given == "plant=emulated emulator=rod_03 emulator.cart=laboratorio"
+    emulated = load_settings(IdentifyConfig, shlex.split(words)).emulator.of_cart(cart)
+    assert emulated.cart_viscous == EmulatorSettings().of_cart(cart).cart_viscous
+    if cart:
+        chosen = ["emulator=rod_03", "emulator.cart=laboratorio"]
+        with pytest.raises(ConfigError, match="give the file of that cart"):
+            load_settings(IdentifyConfig, chosen).emulator.of_cart(cart)
