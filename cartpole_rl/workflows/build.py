@@ -13,6 +13,7 @@ import torch
 from cartpole_rl.agents.baseline import EnergyAndRegulator
 from cartpole_rl.agents.own import OwnPolicy
 from cartpole_rl.checking import validated
+from cartpole_rl.choices import group_choices
 from cartpole_rl.emulator.guards import lever_um
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.envs.build import environment, simulated_env, with_fitted_guard, with_guard_numbers
@@ -298,9 +299,11 @@ def identified_note(training: TrainConfig, config: EvaluateConfig) -> str | None
         return None
     if not (words_of_run(drawn.posterior.parent) or "").startswith("plant=emulated"):
         return None
+    same = [name for name, cart in group_choices("cart").items() if hardware_of(cart) == training.hardware]
+    file = same[0] if same else "<the cart= of cartpole-identify>"
     return (
-        "note: the emulated cart differs from the identified one as the default cart from ip02; to drive one "
-        "that was identified, give emulator.cart=<the cart= of cartpole-identify>"
+        "note: the emulated cart differs from the identified one as the default cart from ip02; to drive the "
+        f"cart that was identified, give emulator.cart={file}"
     )
 
 

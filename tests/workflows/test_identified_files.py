@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import yaml
 
+from cartpole_rl.choices import choice
 from cartpole_rl.emulator.settings import EmulatorSettings
 from cartpole_rl.identification.fit import Fit
 from cartpole_rl.identification.identify import Candidate, Identification, PredictionError
@@ -63,11 +64,17 @@ def test_a_law_of_a_user_has_a_file_with_the_parameters_that_it_brings(
 
 
 @pytest.mark.parametrize(
-    ("counts", "plant", "noted"),
-    [(2400, "emulated", True), (2400, "serial", False), (2400, None, False), (4096, "emulated", False)],
+    ("rig", "plant", "file"),
+    [
+        ({"pole_counts_per_turn": 2400}, "emulated", "<the cart= of cartpole-identify>"),
+        (choice("cart/laboratorio"), "emulated", "laboratorio"),
+        ({"pole_counts_per_turn": 2400}, "serial", None),
+        ({"pole_counts_per_turn": 2400}, None, None),
+        ({}, "emulated", None),
+    ],
 )
 def test_that_an_emulated_cart_is_made_from_identified_numbers_is_noted(
-    counts: int, plant: str | None, noted: bool, nominal: dict[str, float], tmp_path: Path
+    rig: dict[str, float], plant: str | None, file: str | None, nominal: dict[str, float], tmp_path: Path
 ) -> None:
     """Not on ip02's rig, where it has numbers of its own, nor if a real cart was identified."""
     write(Models(), nominal, tmp_path)
@@ -75,15 +82,14 @@ def test_that_an_emulated_cart_is_made_from_identified_numbers_is_noted(
         port = {"plant.port": "auto"} if plant == "serial" else {}
         config = load_settings(IdentifyConfig, {"plant": plant, **port})
         write_config(tmp_path, "identify", config.model_dump(mode="json", by_alias=True))
-    rig = {**nominal_hardware().model_dump(), "pole_counts_per_turn": counts}
     files = {name: tmp_path / f"{name}.yaml" for name in ("pole", "randomization")}
-    cart = yaml.safe_load((tmp_path / "cart.yaml").read_text()) | rig
+    cart = yaml.safe_load((tmp_path / "cart.yaml").read_text()) | nominal_hardware().model_dump() | rig
     training = load_settings(TrainConfig, {"cart": cart, **files})
 
     def note(**given: str) -> str | None:
         return identified_note(training, load_settings(EvaluateConfig, {"run": "any", **given}))
 
-    assert ("give emulator.cart=" in (note(plant="emulated") or "")) == noted
+    assert (note(plant="emulated") or "").partition("give emulator.cart=")[2] == (file or "")
     assert note(plant="simulated") is note(plant="emulated", emulator="sensorsini") is None
 
 
