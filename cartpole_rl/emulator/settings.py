@@ -123,12 +123,12 @@ class EmulatorSettings(Settings):
         """
         check_cart(cart)
         hardware, of_ip02 = hardware_of(cart), choice("cart/ip02")
+        followed = self._numbers_for(hardware) or cart
         if self.hardware == hardware or (self.hardware is None and hardware == nominal_hardware()):
             return self
         if self.hardware is not None:
             raise ConfigError("emulator.hardware: it differs from the rig of cart=; leave it out, give cart=")
-        numbers = completed({**of_ip02, **(self._numbers_for(hardware) or cart)})
-        default = EmulatorSettings()
+        numbers, default = completed({**of_ip02, **followed}), EmulatorSettings()
 
         def times(name: str, of: str = "") -> float:
             return getattr(default, name) * numbers[of or name] / of_ip02[of or name]
@@ -180,15 +180,15 @@ class EmulatorSettings(Settings):
         except ConfigError as error:
             raise ConfigError(f"emulator.cart: {error}") from None
         rig = hardware_of(cart)
-        if rig != hardware and isinstance(self.cart, str) and "cart" not in self.given:
+        if not cart or rig == hardware:
+            return cart
+        if isinstance(self.cart, str) and "cart" not in self.given:
             return {}  # a choice of conf/emulator/ was taken for its pole
-        for name, value in rig if cart else ():
-            if value != (other := getattr(hardware, name)):
-                raise ConfigError(
-                    f"emulator.cart: it has {name} {value:g}, but the cart of this command or of the agent's "
-                    f"training {other:g}; give the file of that cart, or emulator.cart=null"
-                )
-        return cart
+        name, value = next(each for each in rig if each[1] != getattr(hardware, each[0]))
+        raise ConfigError(
+            f"emulator.cart: it has {name} {value:g}, but the cart of this command or of the agent's "
+            f"training {getattr(hardware, name):g}; give the file of that cart, or emulator.cart=null"
+        )
 
 
 def zero_force_motor(cart: Mapping[str, float]) -> float:

@@ -120,7 +120,6 @@ def test_the_emulated_cart_that_is_advised_for_its_pole_fits_every_rig(cart: dic
     assert given == "plant=emulated emulator=rod_03 emulator.cart=laboratorio"
     emulated = load_settings(IdentifyConfig, shlex.split(words)).emulator.of_cart(cart)
     assert emulated.cart_viscous == EmulatorSettings().of_cart(cart).cart_viscous
-    if cart:
-        chosen = ["emulator=rod_03", "emulator.cart=laboratorio"]
-        with pytest.raises(ConfigError, match="give the file of that cart"):
-            load_settings(IdentifyConfig, chosen).emulator.of_cart(cart)
+    chosen = ["emulator=rod_03", "emulator.cart=laboratorio"]
+    with pytest.raises(ConfigError, match="give the file of that cart"):
+        load_settings(IdentifyConfig, chosen).emulator.of_cart(cart)
