@@ -7,13 +7,12 @@ function is imported. conf/<verb>.yaml holds the values of the settings; without
 the class. An entry point in pyproject.toml gives the verb a program of its own.
 """
 
-import gc
 import sys
 from collections.abc import Callable
 from functools import partial
-from importlib import import_module
 from typing import Any, NamedTuple
 
+from cartpole_rl.scheduling import imported
 from cartpole_rl.terminal import program
 
 INTERRUPTED = 130  # exit code after Ctrl-C
@@ -36,11 +35,7 @@ class Verb(NamedTuple):
         if not isinstance(place, str):
             return place
         module, _, name = place.partition(":")
-        gc.disable()  # a quarter of the time of these imports: they make no garbage
-        try:
-            return getattr(import_module(f"cartpole_rl.{module}"), name)
-        finally:
-            gc.enable()
+        return imported(f"cartpole_rl.{module}", name)
 
 
 VERBS: dict[str, Verb] = {

@@ -1,9 +1,12 @@
-"""Scheduling priority of a whole process: driving a cart takes precedence over learning."""
+"""When a process runs, and when it collects garbage: driving a cart takes precedence over learning."""
 
 import gc
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
+from importlib import import_module
+from typing import Any
 
 PRIORITY = 20  # real-time priority, 1 to 99; interrupt threads of Linux's real-time kernels have 50
 
@@ -78,3 +81,19 @@ def no_garbage_collection() -> Iterator[None]:
     finally:
         if enabled:
             gc.enable()
+
+
+def imported(module: str, name: str) -> Any:
+    """Return an object of a module, which is imported without garbage collection: a quarter of its time."""
+    gc.disable()  # imports make no garbage
+    try:
+        return getattr(import_module(module), name)
+    finally:
+        gc.enable()
+
+
+class ImportedFast(partial):
+    """A function as the target of a spawned process, which `imported` finds there."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return imported, (self.func.__module__, self.func.__qualname__)

@@ -1,10 +1,15 @@
-"""The scheduling priority that the operating system reports."""
+"""The scheduling priority that the operating system reports, and imports without garbage collection."""
 
+import gc
 import os
+import pickle
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
+
+from cartpole_rl.scheduling import ImportedFast
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "SCHED_FIFO"), reason="Linux only")
 
@@ -46,3 +51,16 @@ def test_it_goes_first_for_a_while() -> None:
     within, after = map(int, in_a_process(lines).split())
     assert within in (os.SCHED_FIFO, os.SCHED_OTHER)  # where it is allowed; the usual one stays where not
     assert after == os.sched_getscheduler(0)
+
+
+def test_the_target_of_a_process_is_imported_without_garbage_collection(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "slow_one.py").write_text("import gc\ncollects = gc.isenabled()\ndef target(): pass\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    import slow_one
+
+    sent = pickle.dumps(ImportedFast(slow_one.target))
+    monkeypatch.delitem(sys.modules, "slow_one")
+    target = pickle.loads(sent)
+    assert (target.__name__, target.__globals__["collects"], gc.isenabled()) == ("target", False, True)

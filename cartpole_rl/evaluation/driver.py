@@ -25,11 +25,11 @@ from cartpole_rl.evaluation.driving_policy import DrivingPolicy, Weights
 from cartpole_rl.evaluation.episodes import run_batch, warm_up
 from cartpole_rl.plants.serial.preparation import Confirm, nobody
 from cartpole_rl.plants.serial.tracking import LinkStatistics
-from cartpole_rl.scheduling import take_precedence
+from cartpole_rl.scheduling import ImportedFast, take_precedence
 from cartpole_rl.signals import UNWINDING, RaiseOnce, end_with_parent, ending_signals
 from cartpole_rl.tasks.episode import Episode
 
-GRACE = UNWINDING + 4.0  # s from SIGTERM to SIGKILL: after the unwinding, PyTorch takes seconds to end
+GRACE = UNWINDING + 4.0  # s from SIGTERM to SIGKILL: the unwinding, on a busy machine
 Result = tuple[Episode, LinkStatistics]  # the link since the process started
 MakeEnv = Callable[[Confirm], CartPoleEnv]  # over a cart whose faults are cleared if a person confirms
 
@@ -62,7 +62,9 @@ class Driver:
         context = multiprocessing.get_context("spawn")
         self._ours, theirs = context.Pipe()
         self._process = context.Process(
-            target=_serve, args=(theirs, make_env, make_policy, real_time, os.getpid()), daemon=True
+            target=ImportedFast(_serve),
+            args=(theirs, make_env, make_policy, real_time, os.getpid()),
+            daemon=True,
         )
         self._process.start()
         theirs.close()
@@ -146,6 +148,9 @@ def _serve(
         finally:
             for number in endings:  # the motor is off already
                 signal.signal(number, signal.SIG_IGN)
+    with suppress(OSError):
+        print(end="", flush=True)  # what the policy and the environment printed
+    os._exit(0)  # the interpreter would take a second to free PyTorch, while the parent waits
 
 
 def _drive_on_demand(
