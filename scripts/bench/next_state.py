@@ -30,7 +30,6 @@ from common import (
     run_once,
     write_json,
 )
-from scipy.signal import savgol_filter
 from torch import Tensor, nn
 
 from cartpole_rl.evaluation.recordings import read_recording
@@ -73,6 +72,8 @@ class NextState(nn.Module):
 
 def learned(episodes: list[Episode], seed: int) -> NextState:
     """Return a network that has learned the steps of the episodes."""
+    from scipy.signal import savgol_filter  # slow to import
+
     torch.manual_seed(seed)
     before, after, motors = [], [], []
     for episode in episodes:
