@@ -7,6 +7,7 @@ import re
 import shutil
 import sys
 import textwrap
+import traceback
 import warnings
 from collections.abc import Sequence
 from contextlib import suppress
@@ -76,6 +77,10 @@ def run_command(name: str, verb: "Verb") -> None:
                 hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=name)(work)()
     except EXPECTED as error:
         exit_with_message(name, error, kinds(schema, "plant"))
+    except ValueError as error:
+        if not is_of_options(error):
+            raise
+        exit_with_message(name, ConfigError(str(error)))
     except (KeyboardInterrupt, Terminated) as signalled:
         exit_after_signal(name, signalled)
 
@@ -160,11 +165,14 @@ def wrapped(line: str) -> str:
 def wrong_option(words: Sequence[str]) -> str | None:
     """Return the message about the first word with dashes that Hydra does not take; None without one.
 
-    It is a misspelt option, --cfg without its value, or a setting, like `--seed=1` or `--seed 1`.
+    It is a misspelt option, --cfg without its value, or a setting, like `--seed=1` or `--seed 1`; or a port.
     """
     for word, following in pairwise([*words, ""]):
         if word in ("--cfg", "-c") and following not in SHOWN:
             return f"{word}: give {word} job"
+        name = word.partition("=")[0]
+        if name == "--port" or (name in ("-p", "--package") and {"-c", "--cfg"}.isdisjoint(words)):
+            return f"{word}: a port is given as plant=serial plant.port=/dev/ttyUSB0"
         dashed = re.fullmatch(r"--?([A-Za-z_.-]+)=.*|--([A-Za-z_.-]+)", word)
         name = dashed[1] or dashed[2] if dashed else ""
         if any(option.startswith(name) for option in HYDRA_OPTIONS):
@@ -178,6 +186,13 @@ def wrong_option(words: Sequence[str]) -> str | None:
                 setting += "=..." if re.search("=|^--|^$", following) else f"={following}"
             return f"{word}: settings are given without dashes: {setting}"
     return None
+
+
+def is_of_options(error: ValueError) -> bool:
+    """Return True for what Hydra raises for options that exclude or need each other, as in -m --info."""
+    return Path(traceback.extract_tb(error.__traceback__)[-1].filename).is_relative_to(
+        Path(hydra.__file__).parent
+    )
 
 
 def accept_all_characters() -> None:

@@ -580,7 +580,7 @@ def error_message(error: Exception, command: str, words: Sequence[str], plants: 
     if unknown := re.match(r"Could not override '([^']+)'", text):
         inside = getattr(error.__cause__, "full_key", None) or ""  # the key inside of a mapping
         setting = max(unknown[1], inside, key=len)  # of a group without a choice it is the group alone
-        return _unknown_setting(setting, command, words)
+        return _unknown_setting(setting, command, words, plants)
     if wrong := re.search(r"Could not find '([^']+)' Available options in '([^']+)': (.*)", text):
         name = wrong[1].removeprefix(f"{wrong[2]}/")
         if extra := EXTRAS.get(wrong[1]):
@@ -607,7 +607,7 @@ def _no_override(word: str, words: Sequence[str]) -> str:
     return f"{word}: settings are given as key=value, lists as [1,2], text with special characters in quotes"
 
 
-def _unknown_setting(setting: str, command: str, words: Sequence[str]) -> str:
+def _unknown_setting(setting: str, command: str, words: Sequence[str], plants: Collection[str]) -> str:
     """Return the message for a setting that the composed config lacks."""
     group, groups = setting.partition(".")[0], default_choices(command)
     if setting.startswith("layout.keep."):  # takes the name of any column
@@ -618,13 +618,23 @@ def _unknown_setting(setting: str, command: str, words: Sequence[str]) -> str:
         if groups[group] is None and group not in map(key_of, words):
             known = ", ".join(group_choices(group))
             return f"{setting}: {group} is not chosen, so it has no settings; give {group}= too: {known}"
-        choices = group_choices(group).items() if setting != group else ()
-        named = ((name, setting_names({group: _with_defaults(group, values)})) for name, values in choices)
-        if owners := [name for name, names in named if setting in names]:
+        if setting != group and (owners := _owners(setting)):
             return of_another_choice(setting, owners)
     chosen = [word for word in words if re.fullmatch(r"\w+=[\w.-]+", word)]
     settings = known_settings(command, chosen) or known_settings(command, [])
+    of_plant = f"plant.{setting}"
+    owners = [each for each in _owners(of_plant) if each in plants]  # as of port=
+    if owners and of_plant not in settings:
+        return f"{setting}: there is no such setting; {of_another_choice(of_plant, owners)}"
     return no_such_setting(setting, settings | groups.keys())
+
+
+def _owners(setting: str) -> list[str]:
+    """Return the choices of a setting's group that have it."""
+    group = setting.partition(".")[0]
+    choices = group_choices(group).items()
+    named = ((name, setting_names({group: _with_defaults(group, values)})) for name, values in choices)
+    return [name for name, names in named if setting in names]
 
 
 def known_settings(command: str, words: Sequence[str]) -> set[str]:

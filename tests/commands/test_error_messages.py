@@ -133,6 +133,9 @@ def test_a_setting_of_another_choice_names_that_choice(
         (["--config-dir", "mine", "--help"], None),
         (["--multirun", "--info", "all", "--hydra-help", "--resolve"], None),
         (["-m", "-sc", "install=bash"], None),
+        (["--cfg", "job", "-p", "agent"], None),
+        (["-p", "/dev/ttyUSB0"], "-p: a port is given as plant=serial plant.port=/dev/ttyUSB0"),
+        (["--port=COM3"], "--port=COM3: a port is given as plant=serial plant.port=/dev/ttyUSB0"),
         (["seed=1", "--hlep"], "--hlep: did you mean --help?"),
         (["--verison"], "--verison: did you mean --version?"),
         (["--cfg"], "--cfg: give --cfg job"),
@@ -155,3 +158,26 @@ def test_no_setting_is_taken_for_an_option(command: str) -> None:
         assert wrong_option([f"--{setting}", "1"]) == (
             f"--{setting}: settings are given without dashes: {setting}=1"
         )
+
+
+@pytest.mark.parametrize(
+    ("command", "words", "message"),
+    [
+        ("train", "-m --info", "Only one of --run, --multirun, --cfg, --info and --shell_completion can be"),
+        ("find_port", "--resolve", "The --resolve flag can only be used in conjunction with --cfg or --help"),
+        (
+            "finetune",
+            "port=COM3",
+            "port: there is no such setting; plant.port belongs to plant=driver, serial or text: give one",
+        ),
+        ("train", "port=COM3", "port: there is no such setting; "),
+        ("preflight", "port=COM3", "port: there is no such setting; did you mean plant.port?"),
+    ],
+)
+def test_options_that_exclude_each_other_and_ports_get_one_line(
+    command: str, words: str, message: str, tmp_path: Path
+) -> None:
+    done = in_process(command, *words.split(), folder=tmp_path)
+    assert done.complaint.startswith(f"cartpole-{command.replace('_', '-')}: {message}")
+    assert "plant=serial" not in done.complaint or command != "train"
+    assert done.code == 2
