@@ -19,17 +19,33 @@ if TYPE_CHECKING:
     from cartpole_rl.evaluation.recordings import Recording  # imports PyTorch
 
 PRETRAINED = ("medium", "large")  # poles of pretrained agents; the first is the default
+# settings of an emulated cart that are those of one run
+NOT_OF_CART = {"policy": None, "given": (), "knock": 0.0, "journal": None}
 POLES = (*PRETRAINED, "rod_03", "sensorsini", "laboratorio")  # in conf/pole/ and conf/emulator/
 
 
 def other_pole(known: Sequence[PoleSettings], driven: PoleSettings, emulated: bool) -> str | None:
     """Return a warning if `driven` has another pole than those that the agent knows, None if not."""
     if knows(known, driven):
-        return None
+        return other_mass(known, driven)
     choice = emulator_for(known) if emulated else None
     advice = f"; give emulator={choice}" if choice else ""
     trained, own = " or ".join(dict.fromkeys(map(lengths, known))), lengths(driven)
     return f"warning: the agent was trained with a pole of {trained}, the cart has one of {own}{advice}"
+
+
+def other_mass(known: Sequence[PoleSettings], driven: PoleSettings) -> str | None:
+    """Return a warning if a pole of `driven` is as long as a known one, but of another mass; None if not."""
+    if any(poles.choices is None for poles in known):  # rods of random length
+        return None
+    for pole in (driven.each.choices or {}).values():
+        each_known = (each for poles in known for each in (poles.choices or {}).values())
+        alike = [each.pole_mass for each in each_known if each.is_about(pole.length)]
+        if not any(1 / HEAVIER < pole.pole_mass / mass < HEAVIER for mass in alike):
+            trained = " or ".join(f"{mass:.3g} kg" for mass in dict.fromkeys(alike))
+            own = f"{pole.pole_mass:.3g} kg"
+            return f"warning: the agent was trained with a pole of {trained}, the cart has one of {own}"
+    return None
 
 
 def knows(known: Sequence[PoleSettings], driven: PoleSettings) -> bool:
@@ -92,7 +108,7 @@ def plant_words(
     if known and pole == emulated_pole(default) and not knows(known, one_pole(pole)):
         chosen = files.get(emulator_for(known) or "", default)
         pole, cart = emulated_pole(chosen), cart or chosen.cart
-    driven = emulator.model_copy(update={**pole.model_dump(), "cart": cart, "policy": None, "given": ()})
+    driven = emulator.model_copy(update={**pole.model_dump(), "cart": cart, **NOT_OF_CART})
     choices = [
         [f"emulator={name}"] * bool(name) + changed_words("emulator", driven, file.model_dump())
         for name, file in {"": default, **files}.items()

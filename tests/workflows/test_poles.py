@@ -42,6 +42,16 @@ def test_another_pole_gets_a_warning_with_the_emulated_cart_to_choose() -> None:
     assert other_pole([LARGE], EMULATED, emulated=False) == line
 
 
+@pytest.mark.parametrize("mass", [0.05, 0.3])
+def test_a_pole_of_the_same_length_and_another_mass_gets_a_warning(mass: float) -> None:
+    pole = MEDIUM.nominal.model_copy(update={"pole_mass": mass})
+    line = f"warning: the agent was trained with a pole of 0.127 kg, the cart has one of {mass} kg"
+    assert other_pole([MEDIUM, LARGE], one_pole(pole), emulated=True) == line
+    assert other_pole([MEDIUM, one_pole(pole)], one_pole(pole), emulated=True) is None
+    assert other_pole([MEDIUM], EMULATED, emulated=True) is None
+    assert other_pole([RODS], one_pole(pole), emulated=True) is None
+
+
 def test_rods_outside_the_trained_lengths_are_others() -> None:
     line = "warning: the agent was trained with a pole of 0.2 to 0.3 m, the cart has one of 0.35 m"
     assert other_pole([PoleSettings(lengths=(0.2, 0.3))], EMULATED, emulated=False) == line
@@ -109,6 +119,13 @@ def test_the_words_for_a_cart_and_for_the_cart_of_a_run_choose_the_same_cart(
     write_config(imported, "identify", {"seed": 0, "from": str(identified)})
     assert words_of_run(imported) == found
     assert words_of_run(tmp_path) is None
+
+
+def test_the_words_for_a_cart_have_no_knock_and_no_journal(tmp_path: Path) -> None:
+    emulator = EmulatorSettings(knock=2.0, journal=tmp_path / "journal", cart_viscous=2.0)
+    assert (
+        plant_words(EmulatedSettings(kind="emulated"), emulator) == "plant=emulated emulator.cart_viscous=2.0"
+    )
 
 
 @pytest.mark.parametrize("cart", [{}, choice("cart/stepper"), {"track_span": 0.7}])
