@@ -10,7 +10,8 @@ from cartpole_rl.choices import group_choices
 from cartpole_rl.reporting.runs import shared_settings
 
 MOST_NAMED = 8  # settings in a label
-DERIVED = ("guard.numbers", "agent.guard.numbers")  # fitted from other settings: the last to be named
+# fitted from other settings, or what a person gave of an emulated cart: the last to be named
+DERIVED = ("guard.numbers", "agent.guard.numbers", "emulator.given")
 SOURCE = "source"  # of an agent whose run is not there: "pretrained/medium"
 AGENT = "agent"  # prefix of the settings of the agent that a run evaluates
 FREELY_LEFT_OUT = "episodes"  # left out of labels where other settings determine it, whoever chose it
