@@ -249,8 +249,8 @@ def _module(name: str) -> Any:
         if isinstance(error, ConfigError):  # an extension in it is refused
             raise
         if isinstance(error, ModuleNotFoundError) and name.startswith(str(error.name)):
-            places = "it is looked for in the current folder, on PYTHONPATH and among installed packages"
-            raise ConfigError(f"there is no module {error.name!r}; {places}") from None
+            places = "in the current folder, on PYTHONPATH or among installed packages"
+            raise ConfigError(f"there is no module {error.name!r} {places}") from None
         last = traceback.extract_tb(error.__traceback__)[-1]
         why = f"{type(error).__name__}: {' '.join(str(error).split())}"
         raise ConfigError(f"{name} cannot be imported: {why} ({last.filename}, line {last.lineno})") from None

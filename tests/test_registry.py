@@ -107,7 +107,7 @@ def test_the_entry_point_of_an_installed_package(monkeypatch: pytest.MonkeyPatch
         ("own_laws:", "write it as module:name"),
         (
             "nowhere:law",
-            "there is no module 'nowhere'; it is looked for in the current folder, on",
+            "there is no module 'nowhere' in the current folder, on PYTHONPATH or among installed packages",
         ),
         ("own_laws:no", "the module own_laws has no 'no'"),
         ("own_laws:bare", "own_laws:bare is not registered as a test law; docs/extending.md shows how"),

@@ -54,6 +54,7 @@ from cartpole_rl.run_folder import BASELINE, is_own_policy
 from cartpole_rl.settings import Count, Finite, NonNegative, Positive, Seed, Settings
 from cartpole_rl.tasks.settings import ActionSettings, RewardSettings, TaskSettings
 
+OWN_CODE = re.compile(r"[\w.]+=[\w.]+:[\w.]+: [^;]+")  # in an error: a setting that is module:name
 View = Literal["none", "live", "web"]  # of the cart while it is driven: in the terminal, or on a page
 
 
@@ -470,8 +471,13 @@ def load_settings(schema: type[Config], overrides: Mapping[str, Any] | Sequence[
 
 
 def recorded_settings(schema: type[Config], values: Mapping[str, Any], source: str) -> Config:
-    """Return the settings in a checkpoint. Raises CheckpointError that names `source` of another version."""
+    """Return the settings in a checkpoint.
+
+    Raises CheckpointError that names `source` of another version, or code of a user's own that is not found.
+    """
     try:
         return validated(schema, values)
     except ConfigError as error:
+        if own := OWN_CODE.match(str(error)):  # each further one says the same
+            raise CheckpointError(f"{source}: {own[0]}") from None
         raise CheckpointError(f"{source} is of another version of this package: {error}") from None

@@ -293,6 +293,15 @@ def test_a_checkpoint_of_another_version(trained: Path, files: Path) -> None:
     assert done.code == 1
 
 
+def test_an_agent_away_from_its_own_code_is_told_where_that_is_looked_for(trained: Path, files: Path) -> None:
+    content = torch.load(trained / "checkpoints/last.pt", weights_only=True)
+    own = {**content["config"]["agent"], "kind": "nowhere:Agent", "network": "nowhere:deep"}
+    torch.save({**content, "config": {**content["config"], "agent": own}}, files / "own.pt")
+    done = in_process("evaluate", "run=own.pt", folder=files)
+    missing = "there is no module 'nowhere' in the current folder, on PYTHONPATH or among installed packages"
+    assert done.complaint == f"cartpole-evaluate: run=own.pt: agent.kind=nowhere:Agent: {missing}"
+
+
 def test_a_checkpoint_with_another_network(trained: Path, files: Path) -> None:
     content = torch.load(trained / "checkpoints/last.pt", weights_only=True)
     weights = {
