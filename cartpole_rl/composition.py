@@ -205,6 +205,11 @@ class _OwnChoices:
         """Return an override of a command line with names of choices in place of files and mappings."""
         if word.startswith("="):  # Hydra takes "" for a group
             raise ConfigError(_no_override(word, ()))
+        if re.fullmatch(r"\+*(?!label=)[\w.]+=", word):  # as run=$RUN of a script
+            raise ConfigError(f"{word}: the value is missing; give one, or leave {word} out")
+        key, _, name = word.partition("=")
+        if key == "emulator.cart" and (file := self._in_folder("cart", name)):
+            return f"{key}={as_literal(key, file)}"
         match = WORD.fullmatch(word)
         if match is None or not (conf_folder() / match[1]).is_dir() or match[1] == "hydra":
             return word
@@ -313,9 +318,13 @@ class _OwnChoices:
             _check_run_folder(group, name)
             if Path(name).suffix and Path(name).is_file():
                 raise ConfigError(f"{group}={name}: a file of your own must end in .yaml")
-            if self.folder is not None and (file := self.folder / group / f"{name}.yaml").is_file():
-                return file
+            return self._in_folder(group, name) or name
         return name
+
+    def _in_folder(self, group: str, name: str) -> Path | None:
+        """Return the file of a choice in the folder of --config-dir; None without one."""
+        file = self.folder / group / f"{name}.yaml" if self.folder is not None else None
+        return file if file and file.is_file() else None
 
     def _store(self, group: str, chosen: Choice) -> str:
         """Read a choice, hand it to Hydra, and return its name there."""

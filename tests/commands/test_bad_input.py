@@ -20,6 +20,8 @@ WRONG_TRAINING = [
     ("pole=medium,large", "pole=medium,large", "-m runs each"),
     ("seed", "seed", "key=value"),
     ("=8", "=8", "key=value"),  # as $NAME=8 of a script
+    ("hydra.run.dir=", "hydra.run.dir=: the value is missing", "leave hydra.run.dir= out"),  # as $NAME, too
+    ("resume=", "resume=: the value is missing", "leave resume= out"),
     ("experiment medium", "experiment medium", "did you mean experiment=medium?"),
     ("learning.epsilon=0.5", "learning.epsilon=0.5", "give a list, as [0.5]"),
     ("learning.epsilon=[0.5]", "learning.epsilon: ", "value 2 is missing"),

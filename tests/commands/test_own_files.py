@@ -13,7 +13,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from cartpole_rl.checking import validated
 from cartpole_rl.choices import default_choices, group_choices
-from cartpole_rl.composition import compose
+from cartpole_rl.composition import compose, hydra_overrides
 from cartpole_rl.errors import ConfigError
 from cartpole_rl.settings import Settings
 from cartpole_rl.terminal import as_word
@@ -155,6 +155,8 @@ def test_files_of_config_dir(tmp_path: Path) -> None:
     )
     settings = shown(tmp_path, "--config-dir=own", "experiment=trial")
     assert (settings["cart"]["cart_mass"], settings["agent"]["gamma"]) == (1.4, 0.95)
+    with hydra_overrides("emulate", [f"--config-dir={tmp_path}/own", "emulator.cart=lab"]) as (words, _):
+        assert f'emulator.cart="{tmp_path}/own/cart/lab.yaml"' in words
     (tmp_path / "own/cart/ip02.yaml").write_text(HEAVY)
     complaint = refused(tmp_path, "--config-dir", "own", "cart=ip02")
     assert complaint == "--config-dir=own: cart/ip02.yaml has the name of a shipped choice; rename it"

@@ -155,11 +155,13 @@ def only_cart(ports: Iterable[UsbPort]) -> str:
         return carts[0].device
     if carts:
         raise PortError(
-            f"port=auto: {len(carts)} of the ports may be the cart: {named(carts)}; choose one, as "
+            f"plant.port=auto: {len(carts)} of the ports may be the cart: {named(carts)}; choose one, as "
             f"plant.port={carts[0].device}; `cartpole-find-port watch=true` shows which one it is"
         )
     others = f"; there are {named(ports)}" if ports else ""
-    raise PortError(f"port=auto: no port looks like a cart{others}; plug the cart in, or give plant.port=...")
+    raise PortError(
+        f"plant.port=auto: no port looks like a cart{others}; plug the cart in, or give plant.port=..."
+    )
 
 
 def found_ports() -> list[UsbPort]:

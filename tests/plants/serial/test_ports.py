@@ -168,7 +168,7 @@ def test_none_and_several_are_left_to_a_person(ports: list[UsbPort], words: str)
 
 @pytest.mark.skipif(len(cart_like(found_ports())) == 1, reason="a cart is plugged in")
 def test_a_cart_on_auto_says_why_it_finds_none() -> None:
-    with pytest.raises(PortError, match=r"port=auto: .*plant\.port="):
+    with pytest.raises(PortError, match=r"^plant\.port=auto: .*plant\.port="):
         SerialCart(SerialSettings(port="auto")).open()
 
 
