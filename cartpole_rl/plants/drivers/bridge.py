@@ -52,7 +52,7 @@ STOPS = 3  # lines that stop a board; the first may be damaged
 STOPPING = 2.0  # s that a cart which does not stop at the value 0 is given to stop
 STANDS = 1e-3  # m/s, of a cart whose speed is known from what was sent alone
 LARGEST_CREEP = 0.02  # m/s: more is no flicker of the count of a cart that stands
-STANDS_US, STANDS_COUNTS = 500_000, 1  # a measured cart stands if its count stays so near one for this time
+STANDS_US, STANDS_WITHIN = 500_000, 25e-6  # m, or one count: a cart that stays so near for this time stands
 SETTLING = 0.1  # s: how fast such a cart is braked
 EARLY_US = 50_000  # a time stamp that lies so far after the arrival is damaged
 MOST_AHEAD_US = 2_000_000  # of a measured time, before the board is taken for a faster one than at first
@@ -308,6 +308,7 @@ class Bridge:
         self._recent: deque[tuple[int, int]] = deque(maxlen=SAMPLES)  # us and cart count of the newest
         self._changed_us = 0  # when the cart's count last changed
         self._place = self._place_us = 0  # the count about which the cart stands, and since when
+        self._stands_within = max(1, hardware.encoders.cart_counts(STANDS_WITHIN))
         self._measured = 0  # of the control period
         self._stops_left = STOPS  # whatever the board did before
         self._homing_stops = 0  # that a homing of the board needs yet, if it is broken off
@@ -567,7 +568,7 @@ class Bridge:
         self._counts, self._stamp_us = (new.cart, self._pole), new.us
         self._potentiometer.accept(reading, new.us)
         self._measured_us = self._clock.measured_us(new.us, now_us)
-        if not self._recent or abs(new.cart - self._place) > STANDS_COUNTS:
+        if not self._recent or abs(new.cart - self._place) > self._stands_within:
             self._place, self._place_us = new.cart, new.us
         before = self._recent[-1][1] if self._recent else None
         self._recent.append((new.us, new.cart))

@@ -39,7 +39,7 @@ NO_MOTION = (  # the remedy for a cart whose count does not change
 UNSEEN_MOTION = "the motor pushes, but the cart's count does not change"
 
 REST_SECONDS = 0.3
-REST_COUNTS = 2  # of the cart
+RESTS = 45e-6  # m, or two counts: a standing cart moves no more
 LONGEST_REST = 10.0  # s
 SWING_SECONDS = 1.5  # a whole swing of the large pole takes 1.3 s
 
@@ -112,11 +112,11 @@ class ArmedCart:
 
     def rest(self) -> State:
         """Apply motor 0 until the cart is at rest. Raises NotReadyError if it never does."""
-        states = [self.drive(0)]
+        states, rests = [self.drive(0)], max(2, self.hardware.encoders.cart_counts(RESTS))
         for _ in range(self.periods(LONGEST_REST)):
             states.append(self.drive(0))
             counts = [state.cart_counts for state in states[-self.periods(REST_SECONDS) - 1 :]]
-            if len(counts) > self.periods(REST_SECONDS) and spread(counts) <= REST_COUNTS:
+            if len(counts) > self.periods(REST_SECONDS) and spread(counts) <= rests:
                 return states[-1]
         raise NotReadyError(
             f"the cart does not come to rest within {LONGEST_REST:g} s with the motor at 0",

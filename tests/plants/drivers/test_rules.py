@@ -171,6 +171,19 @@ def test_a_stepper_is_left_standing(speed: float, latency: int, monkeypatch: pyt
     assert (len(bridge.played.sent), bridge.played.stops) == (sent, stops)
 
 
+def test_a_stepper_whose_fine_encoder_flickers_is_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
+    fine = RIG.model_copy(update={"cart_nanometres_per_count": 1000})
+    monkeypatch.setitem(globals(), "RIG", fine)
+    bridge = Playing(sends="acceleration", full=12.0)
+    bridge.drive(0, monkeypatch)
+    bridge.measure(*[4, -4] * 30)
+    bridge._stand_in.armed = False
+    bridge.measure(*[4, -4] * 3)
+    sent = len(bridge.played.sent)
+    bridge.measure(*[4, -4] * 30)
+    assert len(bridge.played.sent) == sent
+
+
 def test_a_stepper_whose_count_froze_is_slowed_down_by_what_was_sent(monkeypatch: pytest.MonkeyPatch) -> None:
     bridge = Playing(sends="acceleration", full=12.0, fastest=2.0)
     bridge.drive(0, monkeypatch)

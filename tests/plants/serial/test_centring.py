@@ -1,10 +1,11 @@
 """The controller that centres a cart, on made-up states. On emulated carts: test_recentring.py."""
 
-from itertools import pairwise
+from itertools import cycle, pairwise
 
 import pytest
 
-from cartpole_rl.plants.serial.moves import GENTLE, Centring, nominal_deadband
+from cartpole_rl.plants.serial.errors import NotReadyError
+from cartpole_rl.plants.serial.moves import GENTLE, ArmedCart, Centring, nominal_deadband
 from cartpole_rl.rig.hardware import nominal_hardware
 from cartpole_rl.wire.messages import State
 
@@ -52,3 +53,22 @@ def test_the_planned_speed_changes_gently_and_slows_down_near_the_middle() -> No
 def test_a_cart_that_is_too_fast_is_braked() -> None:
     before, state = at(-FAR, 0), at(-FAR + 400, 1)
     assert Centring(IP02, 0.02, nominal_deadband(IP02)).motor(before, state) < 0
+
+
+class Flickering(ArmedCart):
+    """A cart whose count goes to and fro between 0 and `counts`, of 1 um each."""
+
+    period = 0.02
+
+    def __init__(self, counts: int) -> None:
+        self.hardware = IP02.model_copy(update={"cart_nanometres_per_count": 1000})
+        self.counts = cycle((0, counts))
+
+    def drive(self, motor: int) -> State:
+        return at(next(self.counts))
+
+
+def test_a_cart_rests_by_its_motion_however_fine_its_encoder_is() -> None:
+    Flickering(45).rest()
+    with pytest.raises(NotReadyError, match="does not come to rest"):
+        Flickering(46).rest()
