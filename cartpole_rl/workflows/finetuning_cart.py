@@ -10,8 +10,6 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from cartpole_rl.errors import LearningError, LinkError, RecordingError
 from cartpole_rl.evaluation.driver import Driver, EpisodeRequest
 from cartpole_rl.evaluation.driving_policy import Weights
@@ -144,7 +142,7 @@ class FinetuningCart:
                 return
             lost = f"{stage} {number + 1}: {ending_text(episode)}"
             if losses < LARGEST_LOSSES:
-                tqdm.write(f"{lost}; the episode does not count and is driven again")
+                print(f"{lost}; the episode does not count and is driven again", flush=True)
                 self.driver.start(self.request)
         raise LinkError(f"{lost}, {losses} times in succession: check the cart's cables")
 
@@ -156,10 +154,8 @@ class FinetuningCart:
         self.log.scalars({f"cart/score_{stage}": score, f"cart/guarded_{stage}": share}, step)
         self.log.scalars({f"link/{key}": float(value) for key, value in link.summary().items()}, step)
         self.log.flush()
-        tqdm.write(
-            f"{stage} {number + 1}: {self.measure} {score:z.0f}, "
-            f"ended by {episode.ended_by}{guard_text(episode)}"
-        )
+        ended = f"ended by {episode.ended_by}{guard_text(episode)}"
+        print(f"{stage} {number + 1}: {self.measure} {score:z.0f}, {ended}", flush=True)
 
     def log_learning(self, curves: Mapping[str, float], learned: int) -> None:
         """Log curves at the step of the last episode that was learned from."""

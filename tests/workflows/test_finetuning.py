@@ -1,6 +1,7 @@
 """A fine-tuning: its files, the episodes that count, and a learner that goes on as if it had not stopped."""
 
 import io
+import sys
 from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import replace
@@ -199,13 +200,14 @@ def test_an_evaluation_that_the_link_ended_is_driven_again(
     assert files.episode(Stage.TUNE, 0).time[-1] == 2.0
 
 
-def test_an_episode_is_scored_as_its_task_is(
-    cart: FinetuningCart, capsys: pytest.CaptureFixture[str]
+def test_an_episode_is_scored_as_its_task_is_and_told_at_once(
+    cart: FinetuningCart, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    cart.measure = "score_upright"
+    cart.measure, pipe = "score_upright", io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(pipe))
     scored = replace(EPISODE, score_upright=np.array([3.0, 4.0]))
     cart.keep(Stage.BEFORE, 0, scored, LinkStatistics())
-    assert capsys.readouterr().out == "before 1: score_upright 7, ended by time\n"
+    assert pipe.getvalue() == b"before 1: score_upright 7, ended by time\n"
     assert scalars(cart.files.folder, "cart/score_before") == [(1, 7.0)]
 
 
