@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from command_line import console_script, outcome
 
 from cartpole_rl.choices import choice
 from cartpole_rl.emulator.settings import EmulatorSettings
@@ -313,3 +314,29 @@ def test_a_command_that_is_killed_leaves_the_cart_standing(tmp_path: Path) -> No
         assert abs(last_speed(journal)) < 0.02
         with closing(driven(port)) as plant:  # the port was given back
             plant.reset_one()
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize(
+    ("number", "during", "said"),
+    [(signal.SIGINT, "home", "interrupted"), (signal.SIGTERM, r"a=-?0\.\d*[1-9]\d*", "terminated")],
+    ids=["Ctrl-C while it homes", "SIGTERM while it moves"],
+)
+def test_a_signal_leaves_the_cart_standing_and_the_port_free(
+    number: signal.Signals, during: str, said: str, tmp_path: Path
+) -> None:
+    journal = tmp_path / "journal"
+    journal.touch()
+    with board(journal=str(journal)) as (port, _):
+        given = {**STEPPER, "line": '"a={:.3f}"', "port": port, "homing": "board", "home_line": "home"}
+        words = [f"plant.{name}={value}" for name, value in given.items() if name != "kind"]
+        process = console_script("preflight", "plant=text", "cart=stepper", *words, folder=tmp_path)
+        while not any(re.fullmatch(during, line) for _, line, _ in taken(journal)):
+            assert process.poll() is None
+            time.sleep(0.01)
+        process.send_signal(number)
+        done = outcome(process)
+        assert (done.code, done.err.splitlines()[-1]) == (128 + number, f"cartpole-preflight: {said}")
+        assert abs(last_speed(journal)) < 0.02
+        assert taken(journal)[-1][1] in ("a=0.000", "a=-0.000")
+        driven(port).close()
