@@ -248,7 +248,10 @@ class MotorCommands:
         if self._sends == "value":
             return self._sign * wanted
         largest = self._size + self._damping * self._fastest
-        self._acceleration = max(-largest, min(largest, wanted - self._damping * self._speed))
+        # a line has few decimals: the damping of a cart that creeps would be sent as 0, and it would creep on
+        creeps = self._sends == "acceleration" and motor == 0 and abs(self._speed) < self._creep
+        damping = max(self._damping, 1 / SETTLING) if creeps else self._damping
+        self._acceleration = max(-largest, min(largest, wanted - damping * self._speed))
         if abs(self._speed) >= self._fastest and self._speed * self._acceleration > 0:
             self._acceleration = 0.0
         return self._sign * (self._speed if self._sends == "speed" else self._acceleration)

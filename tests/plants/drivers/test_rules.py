@@ -171,6 +171,28 @@ def test_a_stepper_is_left_standing(speed: float, latency: int, monkeypatch: pyt
     assert (len(bridge.played.sent), bridge.played.stops) == (sent, stops)
 
 
+@pytest.mark.parametrize("period_us", [10_000, 50_000])
+def test_a_stepper_that_creeps_at_motor_0_comes_to_rest(
+    period_us: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With three decimals, the damping of 0.25 mm/s is sent as 0."""
+    monkeypatch.setitem(globals(), "PERIOD_US", period_us)
+    bridge, x, speed, seconds = (
+        Playing(sends="acceleration", full=12.0, damping=2.0),
+        0.0,
+        0.01,
+        period_us / 1e6,
+    )
+    bridge.drive(0, monkeypatch)
+    monkeypatch.setattr(StandIn, "is_idle", lambda stand_in, now_us: False)
+    for _ in range(round(5 / seconds)):
+        bridge.measure(round(x / 25e-6))
+        acceleration = round(bridge.played.sent[-1], 3)
+        x += speed * seconds + acceleration * seconds**2 / 2
+        speed += acceleration * seconds
+    assert abs(speed) < 1e-4  # m/s
+
+
 def test_a_stepper_whose_fine_encoder_flickers_is_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
     fine = RIG.model_copy(update={"cart_nanometres_per_count": 1000})
     monkeypatch.setitem(globals(), "RIG", fine)
