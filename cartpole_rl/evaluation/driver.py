@@ -29,7 +29,7 @@ from cartpole_rl.scheduling import ImportedFast, take_precedence
 from cartpole_rl.signals import UNWINDING, RaiseOnce, end_with_parent, ending_signals
 from cartpole_rl.tasks.episode import Episode
 
-GRACE = UNWINDING + 4.0  # s from SIGTERM to SIGKILL: the unwinding, on a busy machine
+GRACE = UNWINDING + 4.0  # s from SIGTERM to SIGKILL: after the unwinding, PyTorch takes seconds to end
 Result = tuple[Episode, LinkStatistics]  # the link since the process started
 MakeEnv = Callable[[Confirm], CartPoleEnv]  # over a cart whose faults are cleared if a person confirms
 
@@ -148,9 +148,6 @@ def _serve(
         finally:
             for number in endings:  # the motor is off already
                 signal.signal(number, signal.SIG_IGN)
-    with suppress(OSError):
-        print(end="", flush=True)  # what the policy and the environment printed
-    os._exit(0)  # the interpreter would take a second to free PyTorch, while the parent waits
 
 
 def _drive_on_demand(

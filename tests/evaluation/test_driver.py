@@ -7,9 +7,10 @@ import sys
 import termios
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import pytest
 import torch
@@ -58,6 +59,14 @@ def network() -> nn.Module:
     return QAgent(AgentSettings(**choice("agent/dqn")).at(0.02), observation.mirror_signs, 2).greedy_policy()
 
 
+def logging(log: Path) -> nn.Module:
+    """A policy that never closes its log, which Python writes at the end of the process."""
+    policy = network()
+    policy.log = log.open("w")  # type: ignore[assignment]
+    policy.log.write("made")
+    return policy
+
+
 class Faulty(CartPeer):
     """Has a latched fault until it is cleared."""
 
@@ -77,8 +86,10 @@ def peer() -> Iterator[Faulty]:
         yield peer
 
 
-def driver(peer: CartPeer, confirm: Confirm, time_limit: int = LONG) -> Driver:
-    return Driver(partial(scripted_env, peer.port, time_limit=time_limit), network, False, confirm)
+def driver(
+    peer: CartPeer, confirm: Confirm, time_limit: int = LONG, policy: Callable[[], nn.Module] = network
+) -> Driver:
+    return Driver(partial(scripted_env, peer.port, time_limit=time_limit), policy, False, confirm)
 
 
 def test_a_person_who_declines_is_an_error(peer: Faulty, capfd: pytest.CaptureFixture[str]) -> None:
@@ -91,7 +102,7 @@ def test_a_person_who_declines_is_an_error(peer: Faulty, capfd: pytest.CaptureFi
 
 @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGINT])
 def test_a_hangup_and_ctrl_c_stop_the_motor(
-    number: signal.Signals, peer: Faulty, capfd: pytest.CaptureFixture[str]
+    number: signal.Signals, peer: Faulty, capfd: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     """A person confirms; then the terminal signals the process that drives the cart, too."""
     asked = []
@@ -108,13 +119,14 @@ def test_a_hangup_and_ctrl_c_stop_the_motor(
             time.sleep(0.01)
         os.kill(driving.pid, number)
 
-    with driver(peer, confirm) as driving:
+    with driver(peer, confirm, policy=partial(logging, tmp_path / "log")) as driving:
         driving.start(EpisodeRequest(as_weights(network()), 0.0, 0))
         with pytest.raises(LinkError, match="has died"):
             driving.result()
     assert len(asked) == 1
     printed, complained = capfd.readouterr()
     assert (printed, "Traceback" in complained) == (2 * "made\n", False)  # here, and in the process
+    assert (tmp_path / "log").read_text() == "made"
     assert [type(frame.message) for frame in peer.received[-2:]] == [SetMotor, Stop]
     assert peer.state.motor_applied == 0
 
