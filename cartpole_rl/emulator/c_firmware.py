@@ -24,7 +24,7 @@ from cartpole_rl.wire.frames import END, open_envelope
 from cartpole_rl.wire.messages import MESSAGES, Fault, Message, SetMotor
 
 COMPILERS = ("cc", "gcc", "clang")
-FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-ffp-contract=off", f"-DCART_PENDING={MOST_PENDING}")
+FLAGS = ["-std=c99", "-O2", "-Wall", "-Wextra", "-ffp-contract=off", f"-DCART_PENDING={MOST_PENDING}"]
 RIG = {  # macros of cart_rig.h: attributes of Hardware, those in m as um, and comments
     "CART_NANOMETRES": ("cart_nanometres_per_count", "nm per count of the cart's encoder"),
     "CART_POLE_COUNTS": ("pole_counts_per_turn", "counts per turn of the pole's encoder"),

@@ -131,13 +131,15 @@ def wider_ranges(extra: float) -> dict[str, Range]:
 def wider_range(name: str, line: Range, extra: float, nominal: float) -> Range:
     """Return `line` extended on the axis on which it is uniform, but not to impossible values below it."""
     logarithmic = line.distribution == "log_uniform"
-    low, high = widened(tuple(map(math.log, line.limits())) if logarithmic else line.limits(), extra)
+    low, high = line.limits()
     if logarithmic:
-        low, high = math.exp(low), math.exp(high)
+        low, high = map(math.exp, widened((math.log(low), math.log(high)), extra))
+    else:
+        low, high = widened((low, high), extra)
     if not PARAMETERS[name].bound.holds(low * (nominal if line.scales_nominal else 1.0)):
         low = line.limits()[0]
     kind = "factor" if line.scales_nominal else "absolute"
-    return Range(distribution=line.distribution, **{kind: (low, high)})
+    return Range.model_validate({"distribution": line.distribution, kind: (low, high)})
 
 
 def trained_and_judged(job: Job, overrides: Mapping[str, Any]) -> dict[str, Any]:

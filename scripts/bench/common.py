@@ -154,8 +154,8 @@ def reference_scores() -> dict[str, float]:
 
 def min_median_max(values: Sequence[float], decimals: int) -> dict[str, str]:
     """Return three table cells that summarize one figure over the seeds."""
-    summaries = {"min": np.min, "median": np.median, "max": np.max}
-    return {name: f"{summary(values):.{decimals}f}" for name, summary in summaries.items()}
+    found = {"min": min(values), "median": np.median(values), "max": max(values)}
+    return {name: f"{value:.{decimals}f}" for name, value in found.items()}
 
 
 def print_table(rows: Sequence[Mapping[str, Cell]]) -> None:

@@ -89,7 +89,7 @@ class Carts(NamedTuple):
 def run_dynamics(carts: Carts, inputs: Inputs, *, substeps: int) -> Carts:
     """Run K control periods of N carts; score each and reset the carts whose episodes ended."""
     parameters = CartParameters(inputs.table)
-    state, force, motor, steps, total = State(*carts[:4]), carts.force, carts.motor, carts.steps, 0.0
+    state, force, motor, steps, total = State(*carts[:4]), *carts[4:7], torch.zeros_like(carts.score)
     start = State(*inputs.starts.unbind(0))
     for given in inputs.motors.unbind(0):
         drive = Drive(force, (given, motor))

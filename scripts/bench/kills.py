@@ -41,7 +41,7 @@ STAGES = ("before", "tune", "after")
 
 def start(words: list[str], log: Path) -> "subprocess.Popen[bytes]":
     """Start cartpole-finetune."""
-    command = [Path(sys.executable).with_name("cartpole-finetune"), *words]
+    command = [str(Path(sys.executable).with_name("cartpole-finetune")), *words]
     with log.open("ab") as output:
         return subprocess.Popen(command, stdout=output, stderr=output)
 
@@ -67,7 +67,8 @@ def changed(before: dict[str, bytes], after: dict[str, bytes]) -> list[str]:
 
 def kill_and_resume(words: list[str], run: Path, kills: int, dice: random.Random) -> list[str]:
     """Kill and resume a fine-tuning, then let it run to its end; return all complaints."""
-    log, kept, complaints = run.parent / "log.txt", {}, []
+    log, complaints = run.parent / "log.txt", list[str]()
+    kept: dict[str, bytes] = {}
     for number in range(kills):
         process, seconds = start(words, log), dice.uniform(EARLIEST, LATEST)
         try:

@@ -14,6 +14,7 @@ An agent of experiment=medium is then trained in each network, and its last chec
 """
 
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -161,8 +162,8 @@ def judged(seed: int) -> dict[str, Any]:
     found, physics = prediction_error(network, held_out), read_json(moved / "identification.json")
     agent = folder / "agent"
     if not (agent / "metrics.json").exists():
-        SimulatedSettings.build = lambda *given: network_carts(network, *given)
-        train(load_settings(TrainConfig, {"randomization": "none", "seed": seed}), agent)
+        with patch.object(SimulatedSettings, "build", lambda *given: network_carts(network, *given)):
+            train(load_settings(TrainConfig, {"randomization": "none", "seed": seed}), agent)
     judge = run_once(folder / "emulated", "evaluate", f"run={agent}", *cart, "episodes=10")
     return {
         "seed": seed,

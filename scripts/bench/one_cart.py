@@ -121,11 +121,11 @@ def main() -> None:
     torch.set_num_threads(1)
     peer = steps_per_second(PEER, options.steps)
     rates = {name: steps_per_second(name, options.steps) for name in OURS}
-    rows = [
+    rows: list[dict[str, Any]] = [
         {"environment": name, "steps_per_s": rate, "ratio": rate / peer}
         for name, rate in [(PEER, peer), *rates.items()]
     ]
-    ticks = [
+    ticks: list[dict[str, Any]] = [
         {"lockstep": name, **lockstep(options.episodes, beside)}
         for name, beside in (("alone", False), ("beside a busy process", True))
     ]

@@ -207,7 +207,8 @@ def subsets(recorded: Sequence[Path], seconds: float, seed: int) -> list[Path]:
 
 def by_seconds(run: Path, windows: Windows, folder: Path) -> dict[int, list[dict[str, Any]]]:
     """Return the errors of carts that are identified from fewer recordings."""
-    recorded, found = sorted((run / RECORDINGS).iterdir()), {}
+    recorded = sorted((run / RECORDINGS).iterdir())
+    found: dict[int, list[dict[str, Any]]] = {}
     for seconds in SECONDS:
         found[seconds] = []
         for seed in range(SETS):

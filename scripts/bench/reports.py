@@ -53,7 +53,8 @@ def copy_run(run: Path, copy: Path, setting: str, number: int) -> None:
 
 def measured(runs: Path, report: Path, words: list[str]) -> dict[str, Any]:
     """Make a report of the folder `runs`; return its times, its peak memory and the size of its page."""
-    command = [Path(sys.executable).with_name("cartpole-report"), f"runs={runs}", f"hydra.run.dir={report}"]
+    program = str(Path(sys.executable).with_name("cartpole-report"))
+    command = [program, f"runs={runs}", f"hydra.run.dir={report}"]
     start = time.perf_counter()
     done = subprocess.run([sys.executable, "-c", PEAK, *command, *words], check=True, stdout=subprocess.PIPE)
     peak, processor = done.stdout.split()

@@ -218,7 +218,7 @@ def drive(case: Case, firmware: str, seed: int) -> dict[str, Any]:
         truth = {"firmware": firmware, "clock": "real", "port": "tcp", "seed": seed, "journal": journal}
         dice = random.Random(f"{case.name} {seed}")
         with (
-            EmulatedCart(EmulatorSettings(**truth | case.emulator)) as cart,
+            EmulatedCart(EmulatorSettings.model_validate(truth | case.emulator)) as cart,
             Proxy(cart.port, case, dice) as proxy,
         ):
             printed = episode_line(proxy.url)
@@ -293,7 +293,7 @@ def values_of_the_host(events: Sequence[dict[str, Any]]) -> Iterator[tuple[int, 
 
 def summary(results: Sequence[dict[str, Any]]) -> list[dict[str, Cell]]:
     """Return a row for each case."""
-    rows = []
+    rows: list[dict[str, Cell]] = []
     for case in CASES:
         of_case = [each for each in results if each["case"] == case.name]
         if not of_case:

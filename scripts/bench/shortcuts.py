@@ -17,6 +17,7 @@ A time is the processor time of the fastest of many calls, in which the rows tak
 """
 
 import time
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -100,7 +101,7 @@ def choices(agent: QAgent, size: int) -> Pair:
     """The greedy action of one cart for an observation of `size` numbers."""
     policy = agent.greedy_policy()
     present = TensorDict({"observation": torch.randn(1, size)}, [1])
-    ways = {
+    ways: dict[str, Callable[[TensorDict], Any]] = {
         "QValueActor": policy,
         "QValueActor, torch.compile": torch.compile(policy),
         "DrivingPolicy, traced": DrivingPolicy(policy),

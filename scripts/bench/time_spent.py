@@ -70,7 +70,8 @@ def main() -> None:
     parser = option_parser(__doc__)
     parser.add_argument("overrides", nargs="*", help="overrides of cartpole-train")
     options = parser.parse_intermixed_args()
-    AGENTS.find("dqn").learner = TimedTraining
+    dqn: Any = AGENTS.find("dqn")
+    dqn.learner = TimedTraining
     with tempfile.TemporaryDirectory() as folder:
         sys.argv = ["cartpole-train", *options.overrides, f"hydra.run.dir={folder}/run"]
         run("train")

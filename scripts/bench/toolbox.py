@@ -35,7 +35,13 @@ INSTALLED = hasattr(sysid, "optimize")  # with all that it requires
 SUBSTEPS = 8  # of MuJoCo in a control period
 SCREENING, ROUNDS = 3, 6  # rounds from each start, with a part of the windows, and from the best
 SCREENED = 5  # one window in so many
-SEARCH = {"optimizer": "scipy_parallel_fd", "x_scale": "jac", "diff_step": 1e-6, "max_iters": 4, "ftol": 1e-4}
+SEARCH: dict[str, Any] = {
+    "optimizer": "scipy_parallel_fd",
+    "x_scale": "jac",
+    "diff_step": 1e-6,
+    "max_iters": 4,
+    "ftol": 1e-4,
+}
 STARTS = (1.0, 3.0, 10.0)  # of the cart's mass, force and friction, times those of cart=sensorsini
 BOUNDS = {
     "cart_mass": (0.05, 10.0),  # kg

@@ -76,7 +76,7 @@ def widened(bounds: tuple[float, float], share: float, smallest: float = -math.i
 
 def simulated_cart(truth: Mapping[str, object]) -> dict[str, float]:
     """Return the simulator's parameters of the cart and its pole for a truth. Some are nominal."""
-    return simulated(EmulatorSettings(**truth), choice("cart/ip02"))
+    return simulated(EmulatorSettings.model_validate(truth), choice("cart/ip02"))
 
 
 def simulated(emulated: EmulatorSettings, cart: Mapping[str, float]) -> dict[str, float]:

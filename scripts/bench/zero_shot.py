@@ -68,7 +68,7 @@ def drive(run: str, truth: Truth, starts: int) -> Scores:
     """Return the scores of the agent of `run` on a new emulated cart."""
     given = {"run": run, "episodes": starts, "plant": "emulated", "seed": 1, "threads": 1}
     config, agent = load_settings(EvaluateConfig, given), agent_of(run)
-    config = config.model_copy(update={"emulator": EmulatorSettings(**truth)})
+    config = config.model_copy(update={"emulator": EmulatorSettings.model_validate(truth)})
     with closing(evaluated_env(evaluated_settings(agent.training, config), config, print)) as env:
         return [episode_score(env, agent.policy, truth) for _ in range(starts)]
 

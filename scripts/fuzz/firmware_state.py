@@ -1,7 +1,6 @@
 """The whole state of the Python firmware as numbers, in the order of ``cart_snapshot`` of the C firmware."""
 
 import struct
-from types import GeneratorType
 from typing import Any
 
 from cartpole_rl.emulator.firmware import Firmware
@@ -125,8 +124,8 @@ def homing(firmware: Any) -> list[int]:
     ]
 
 
-def generators(outermost: GeneratorType | None) -> list[Any]:
-    """Return a generator and those that it waits for."""
+def generators(outermost: Any) -> list[Any]:
+    """Return a generator, if it is one, and those that it waits for."""
     stack = []
     while outermost is not None:
         stack.append(outermost)

@@ -55,8 +55,8 @@ def draw_truth(random: np.random.Generator, clock: str, journal: Path) -> Emulat
         truth["reset_at"] = moment
     elif failure > 1:
         truth |= {"stuck_encoder": ("cart", "pole")[failure - 2], "stuck_at": moment}
-    seed = int(random.integers(2**31))
-    return EmulatorSettings(clock=clock, seed=seed, journal=journal, physics_step=1e-3, **truth)
+    truth |= {"clock": clock, "seed": int(random.integers(2**31)), "journal": journal}
+    return EmulatorSettings(physics_step=1e-3, **truth)
 
 
 def environment(truth: EmulatorSettings) -> CartPoleEnv:
@@ -108,7 +108,7 @@ def reason(error: PlantError) -> str:
 
 def stop_times(journal: Path) -> list[float]:
     """Return the ms from the last accepted motor value to motor 0 or the brake, for each arming."""
-    times, last, zero = [], None, 0
+    times, last, zero = list[float](), None, 0
     moving = False  # the motor value in force is neither 0 nor the brake's
 
     def note() -> None:

@@ -281,7 +281,7 @@ def main() -> int:
     if not options.plain:
         if "libasan" not in os.environ.get("LD_PRELOAD", ""):
             return restart_with_sanitizers()
-        c_firmware.FLAGS = (*c_firmware.FLAGS, *SANITIZERS)
+        c_firmware.FLAGS = [*c_firmware.FLAGS, *SANITIZERS]
     started = time.perf_counter()
     try:
         counts = run(options.bytes, options.frames, options.seed, hardware_of(json.loads(options.rig)))

@@ -28,6 +28,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TextIO
 
 from cartpole_rl.emulator.c_firmware import rig_header
 from cartpole_rl.emulator.physics import CartPhysics
@@ -115,7 +116,7 @@ def board(program: Path, pins: Path) -> Iterator[str]:
             process.wait()
 
 
-def read_port(process: "subprocess.Popen[bytes]", log: "tempfile._TemporaryFileWrapper[str]") -> str:
+def read_port(process: "subprocess.Popen[bytes]", log: TextIO) -> str:
     """Return the pseudo-terminal that QEMU names. Exits if QEMU does not start."""
     deadline = time.monotonic() + PATIENCE
     while True:

@@ -121,8 +121,14 @@ class KnownCart:
         count, period, substeps = carts.table.shape[1], self.config.control_period, self.config.plant.substeps
         size = next((size for size in COMPILED_SIZES if size >= count), 0)
         if not self.compiled or count == 1 or not size:
-            run = {"models": self.models, "period": period, "substeps": substeps, "encoders": self.encoders}
-            return run_carts(carts, inputs, **run)
+            return run_carts(
+                carts,
+                inputs,
+                models=self.models,
+                period=period,
+                substeps=substeps,
+                encoders=self.encoders,
+            )
         rows = torch.arange(size).clamp(max=count - 1)
         padded = (type(each)(*(value[:, rows] for value in each)) for each in (carts, inputs))
         after = compiled_run(self.models, period, substeps, self.encoders, (len(carts.drive), size))(*padded)
