@@ -5,7 +5,7 @@ from pathlib import Path
 
 import hydra
 import pytest
-from command_line import in_process
+from command_line import COARSE, in_process
 
 from cartpole_rl.checking import validated
 from cartpole_rl.composition import compose, reading_conf
@@ -40,6 +40,13 @@ def test_the_emulated_cart_is_ready(tmp_path: Path) -> None:
     taken = [line for line in journal.read_text().splitlines() if '"took"' in line]
     assert '"STOP"' in taken[-1]  # it is left disarmed
     assert list(tmp_path.iterdir()) == [journal]
+
+
+def test_a_stepper_whose_pole_still_swings_is_ready(tmp_path: Path) -> None:
+    """It does not feel its pole, which goes on swinging, and it glides after a push."""
+    done = in_process("preflight", "cart=stepper", "plant=emulated", COARSE, folder=tmp_path)
+    assert (done.code, done.err) == (0, ""), done
+    assert len(done.out.splitlines()) == len(CHECKS) + 2
 
 
 @pytest.mark.parametrize(

@@ -46,10 +46,10 @@ PERIOD_TOLERANCE = 0.02  # of the period in INFO
 ROUND_TRIP_SHARE = 0.5  # of a period: a command that comes later acts in the next one
 
 SURELY_MOVED = 0.001  # m
-POLE_MOVED = 1.25  # degrees; more, where the pole still swings
+POLE_MOVED = 1.0  # degrees; more, where the pole still swings
 PUSH = 1.4  # m/s^2, of a push in the middle
 LONGEST_PUSH, FARTHEST_PUSH = 0.3, 0.035  # s, m
-DRIFT = 4  # periods over which a remaining swing is measured
+REPEATED, LONGEST_SWING = 1.0, 2.0  # s of counts that are compared; a whole swing of a rod of 1.5 m
 NO_SWING, LONG_PATIENCE = 0.5, 15.0  # degrees peak to peak, s
 LARGEST_DEADBAND = 150  # motor value; of nine_levels the two weakest, 100 and 150, would not move such a cart
 STEPS = 4  # for the latency, two to each side
@@ -168,7 +168,6 @@ class Probe(ArmedCart):
         """
         other_side = {-side: motor for side, motor in self.deadband.items()}
         known = nominal_deadband(self.hardware) | other_side | self.deadband
-        self.rest()
         centre(self, known, NEAR, LEAST_SPEED)
         self.rest()
 
@@ -313,23 +312,26 @@ def push_motor(probe: "Probe", side: int) -> int:
 def pole_direction(probe: Probe) -> str:
     """Check that a push to the right leaves the hanging pole's tip behind, on the left: its count goes up.
 
-    A remaining swing is assumed to continue evenly during the push, and is subtracted.
+    What the remaining swing would have done without the push is subtracted.
     """
     no_swing = probe.pole_counts(NO_SWING)
     states, swing = probe.calm(no_swing, LONG_PATIENCE)
-    before, drift = states[-1], (states[-1].pole_counts - states[-1 - DRIFT].pole_counts) / DRIFT
-    enough = max(probe.pole_counts(POLE_MOVED), no_swing + swing // 2)
+    swings = swing > no_swing
+    expected, error = swinging_on(probe, [state.pole_counts for state in states], swings)
+    before, enough = states[-1], max(probe.pole_counts(POLE_MOVED), no_swing + 2 * error)
     value = push_motor(probe, RIGHT)
-    for period in range(1, probe.periods(LONGEST_PUSH) + 1):
+    for unpushed in expected:
         after = probe.drive(value)
-        swung = round(after.pole_counts - before.pole_counts - drift * period)
+        swung = after.pole_counts - unpushed
         if abs(swung) >= enough or probe.metres(abs(after.cart_counts - before.cart_counts)) > FARTHEST_PUSH:
             break
     if abs(swung) < enough:
         raise NotReadyError(
             f"the pole's count does not follow a push of the cart; it changed by {swung:+d}, and swung by "
             f"{swing} before",
-            "check the cable of the pole's encoder, and that the pole is screwed to its shaft",
+            "let the pole hang still, and start again"
+            if swings
+            else "check the cable of the pole's encoder, and that the pole is screwed to its shaft",
         )
     probe.centre()
     if swung < 0:
@@ -339,6 +341,24 @@ def pole_direction(probe: Probe) -> str:
             "plant.pole_reversed)",
         )
     return f"a push to the right swings the hanging pole to the left, {swung:+d} counts"
+
+
+def swinging_on(probe: Probe, counts: list[int], swings: bool) -> tuple[list[int], int]:
+    """Return the next counts of a pole without a push, for LONGEST_PUSH, and their error.
+
+    A swing repeats itself, after the time at which the last counts are most like earlier ones. The error is
+    the largest difference from those.
+    """
+    pushed, window = probe.periods(LONGEST_PUSH), probe.periods(REPEATED)
+    if not swings:
+        return [counts[-1]] * pushed, 0
+
+    def error(lag: int) -> int:
+        earlier = counts[-window - lag : -lag]
+        return max(abs(new - old) for new, old in zip(counts[-window:], earlier, strict=True))
+
+    lag = min(range(pushed, probe.periods(LONGEST_SWING) + 1), key=error)
+    return counts[-lag : len(counts) - lag + pushed], error(lag)
 
 
 def deadband(probe: Probe) -> str:

@@ -1,6 +1,7 @@
 """The checks of a cart, on the emulated one: a good one, wires the wrong way round, and other faults."""
 
 import json
+import math
 import re
 from collections.abc import Iterator
 from dataclasses import replace
@@ -9,6 +10,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from serial_peer import INFO, Between, CartPeer
 
@@ -27,6 +29,7 @@ from cartpole_rl.plants.serial.preflight import (
     pole_direction,
     preflight,
     soft_limit,
+    swinging_on,
 )
 from cartpole_rl.plants.settings import SerialSettings
 from cartpole_rl.rig.hardware import nominal_hardware
@@ -94,6 +97,19 @@ def test_what_is_measured_is_the_truth(probe: Probe) -> None:
     assert "confirms the value after 20 ms" in words
     assert "not reached" in soft_limit(probe)
     assert probe.farthest * 22749e-9 < 0.05
+
+
+@pytest.mark.parametrize("seconds", [0.7, 0.95, 1.3, 2.0])  # of a swing
+def test_a_swing_goes_on_as_it_did(probe: Probe, seconds: float) -> None:
+    times = 0.02 * np.arange(350)
+    counts = np.rint(2048 + 40 * np.exp(-times / 20) * np.sin(2 * math.pi * times / seconds)).astype(int)
+    expected, error = swinging_on(probe, counts[:300].tolist(), swings=True)
+    assert len(expected) == 15
+    assert np.abs(expected - counts[300:315]).max() <= error + 1 <= 6
+
+
+def test_a_pole_that_hangs_still_goes_on_hanging(probe: Probe) -> None:
+    assert swinging_on(probe, [2048, 2049, 2047, 2048], swings=False) == ([2048] * 15, 0)
 
 
 class Recording(Probe):
