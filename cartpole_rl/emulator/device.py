@@ -11,7 +11,7 @@ import sys
 import time
 from collections import deque
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from cartpole_rl.emulator.c_firmware import CFirmware
 from cartpole_rl.emulator.firmware import BANNER, Firmware
@@ -47,7 +47,7 @@ class CartDevice:
         """
         self._settings = settings
         self._hardware = settings.hardware or nominal_hardware()
-        self._encoders = self._hardware.encoders
+        self._metres, self._radians = self._hardware.encoders.resolution
         self.physics = CartPhysics(settings)
         self._journal = Journal(settings.journal) if settings.journal else None
         self.physics.on_contact = self._touch
@@ -115,18 +115,21 @@ class CartDevice:
 
     def _move(self, until_us: int) -> None:
         """Let the cart move until `until_us`, while the firmware looks at its position."""
-        start_us, rate = self.now_us, self._settings.clock_rate
+        start_us, rate, firmware = self.now_us, self._settings.clock_rate, self.firmware
+        motor = firmware.motor
 
         def look(seconds: float) -> int:
+            nonlocal motor
             self.now_us = start_us + round(seconds * rate * 1e6)
             if self.now_us - self._looked_us >= LOOK_US:
                 self._looked_us = self.now_us
-                self.firmware.switches = self.physics.switches
-                self.firmware.look(self.now_us - self._booted_us, *self._counts())
+                firmware.switches = self.physics.switches
+                firmware.look(self.now_us - self._booted_us, *self._counts())
                 self._note_motor()
-            return self.firmware.motor
+                motor = firmware.motor
+            return motor
 
-        self.physics.advance(self.firmware.motor, (until_us - start_us) / 1e6 / rate, look)
+        self.physics.advance(motor, (until_us - start_us) / 1e6 / rate, look)
         self.now_us = until_us
 
     def _note_motor(self) -> None:
@@ -155,7 +158,7 @@ class CartDevice:
     def _new_firmware(self) -> Firmware | CFirmware:
         """Return the firmware that the settings choose, just booted."""
         cart, rig = self._settings, self._hardware
-        zero_error = round(cart.angle_offset / self._encoders.radians)
+        zero_error = round(cart.angle_offset / self._radians)
         lever = lever_um(cart.model_dump())
         if cart.firmware == "c":
             return CFirmware(self._latency_us, zero_error, lever, cart.policy, 2 * cart.pole_com, rig)
@@ -164,16 +167,12 @@ class CartDevice:
     def _counts(self) -> tuple[int, int]:
         """Return the raw counts of cart and pole since boot."""
         cart, pole = self._disc_counts()
-        cart, pole = self._maybe_stuck("cart", cart), self._maybe_stuck("pole", pole)
+        if self._stuck_us is not None and self.now_us >= self._stuck_us:
+            of_cart = self._settings.stuck_encoder == "cart"
+            if self._stuck_count is None:
+                self._stuck_count = cart if of_cart else pole
+            cart, pole = (self._stuck_count, pole) if of_cart else (cart, self._stuck_count)
         return cart - self._boot[0], pole - self._boot[1]
-
-    def _maybe_stuck(self, encoder: Literal["cart", "pole"], count: int) -> int:
-        """Return the count, or the frozen count of a stuck encoder."""
-        if encoder != self._settings.stuck_encoder or self._stuck_us is None or self.now_us < self._stuck_us:
-            return count
-        if self._stuck_count is None:
-            self._stuck_count = count
-        return self._stuck_count
 
     def _disc_counts(self) -> tuple[int, int]:
         """Return the counts of the encoder discs.
@@ -181,10 +180,9 @@ class CartDevice:
         The position of the pole's disc includes the fraction of `angle_offset` that is below a count; the
         firmware's zero, a whole number, includes the rest.
         """
-        angle = self.physics.angle + self._settings.angle_offset
-        return math.floor(self.physics.x / self._encoders.metres), math.floor(
-            angle / self._encoders.radians + 0.5
-        )
+        x, angle = self.physics.position
+        angle += self._settings.angle_offset
+        return math.floor(x / self._metres), math.floor(angle / self._radians + 0.5)
 
     def _latency_us(self) -> int:
         jitter = self._settings.latency_jitter

@@ -97,11 +97,11 @@ class CartPhysics:
         thin = settings.pole_inertia * 1e-3  # about the pole's own axis, about which nothing rotates
         # A motor that feels a share of the pole moves as a cart that is so much heavier, under larger forces.
         self._larger = larger = 1 / max(settings.backdrivability, LEAST_FELT)
-        self._rig = settings.hardware or nominal_hardware()
-        half = settings.track_half_length
-        self._left_stop = -half - STOP_BEHIND * self._rig.left_switch
-        self._right_stop = half + STOP_BEHIND * self._rig.right_switch
-        self.switches = 0  # end switches that the cart presses, as bits: 1 left, 2 right
+        rig, half = settings.hardware or nominal_hardware(), settings.track_half_length
+        self._left_stop = -half - STOP_BEHIND * rig.left_switch
+        self._right_stop = half + STOP_BEHIND * rig.right_switch
+        self._has_switches = rig.switches  # end switches, as bits: 1 left, 2 right
+        self.switches = 0  # those that the cart presses
         numbers = settings.model_dump() | {
             "left_stop": self._left_stop,
             "right_stop": self._right_stop,
@@ -138,6 +138,12 @@ class CartPhysics:
         return self._data.qpos.item(1) + self._settings.track_tilt
 
     @property
+    def position(self) -> tuple[float, float]:
+        """`x` and `angle`, read at once."""
+        x, angle = self._data.qpos.tolist()
+        return x, angle + self._settings.track_tilt
+
+    @property
     def angle_dot(self) -> float:
         """Pole angular velocity, rad/s."""
         return self._data.qvel.item(1)
@@ -146,7 +152,7 @@ class CartPhysics:
         """Place the cart at x m, at rest, and the pole at an angle and angular velocity, rad and rad/s."""
         self._data.qpos[0] = x
         self._data.qvel[0] = 0.0
-        self._press_switches()
+        self._press_switches(x)
         self.place_pole(angle, angle_dot)
 
     def place_pole(self, angle: float, angle_dot: float = 0.0) -> None:
@@ -163,19 +169,20 @@ class CartPhysics:
         if steps == 0:
             return
         step = seconds / steps
-        self._model.opt.timestep = step
-        drag, friction = self._settings.pole_drag, self._model.dof_frictionloss
-        applied = self._data.qfrc_applied
+        model, data, drag = self._model, self._data, self._settings.pole_drag
+        position, speed, applied, friction = data.qpos, data.qvel, data.qfrc_applied, model.dof_frictionloss
+        model.opt.timestep = step
         decay = self._motor.decay(step)
-        target = self._enforce(motor)
+        target, x = self._enforce(motor), self.x
         for number in range(1, steps + 1):
-            x_dot, angle_dot = self._data.qvel.tolist()
-            applied[0] = self._larger * (self._motor.step(target, decay) + self._cogging(self.x)) + self._held
+            x_dot, angle_dot = speed.tolist()
+            applied[0] = self._larger * (self._motor.step(target, decay) + self._cogging(x)) + self._held
             applied[1] = -drag * angle_dot * abs(angle_dot)
             friction[0] = self._cart_friction(x_dot)
-            self._mj_step(self._model, self._data)
-            self._notice_contact(abs(x_dot))
-            self._press_switches()
+            self._mj_step(model, data)
+            x = position.item(0)
+            self._notice_contact(x, x_dot)
+            self._press_switches(x)
             if look is not None and (chosen := look(number * step)) != motor:
                 motor, target = chosen, self._enforce(chosen)
 
@@ -184,25 +191,25 @@ class CartPhysics:
         self._model.dof_damping[0] = self._viscous * self._motor.friction_share(motor)
         return self._motor.static_force(motor)
 
-    def _notice_contact(self, speed: float) -> None:
-        """Report it if the cart, which ran at `speed` m/s, has just touched an end stop."""
-        touches = not self._left_stop < self.x < self._right_stop
+    def _notice_contact(self, x: float, x_dot: float) -> None:
+        """Report it if the cart, now at `x` m, has just touched an end stop, at `x_dot` m/s."""
+        touches = not self._left_stop < x < self._right_stop
         if touches and not self._touches and self.on_contact is not None:
-            self.on_contact(speed)
+            self.on_contact(abs(x_dot))
         self._touches = touches
 
-    def _press_switches(self) -> None:
+    def _press_switches(self, x: float) -> None:
         """Press the switches that the rig has, at the ends of the track."""
-        if self._rig.switches:
-            x, half = self.x, self._settings.track_half_length
+        if self._has_switches:
+            half = self._settings.track_half_length
             left = -x >= half - HYSTERESIS * (self.switches & 1)
             right = x >= half - HYSTERESIS * (self.switches >> 1)
-            self.switches = self._rig.switches & (left + 2 * right)
+            self.switches = self._has_switches & (left + 2 * right)
 
     def _cogging(self, x: float) -> float:
         """Return the cogging force, which pulls the cart to the nearest stable position, N."""
-        settings = self._settings
-        return -settings.cogging * math.sin(math.tau * x / settings.cogging_pitch)
+        cogging = self._settings.cogging
+        return -cogging * math.sin(math.tau * x / self._settings.cogging_pitch) if cogging else 0.0
 
     def _cart_friction(self, x_dot: float) -> float:
         """Return the largest dry friction that the rail can exert now, N."""

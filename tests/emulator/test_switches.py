@@ -29,7 +29,7 @@ def settings_of(switches: int) -> dict[str, Any]:
 def reads(driven: Driven, switches: Callable[[float], int]) -> None:
     """Let the switches read what a function of the cart's place returns."""
     physics = driven.cart.physics
-    physics._press_switches = lambda: setattr(physics, "switches", switches(physics.x))
+    physics._press_switches = lambda x: setattr(physics, "switches", switches(x))
 
 
 def home_from(place: float, switches: int, firmware: str, period_us: int) -> tuple[Driven, State, float]:
@@ -108,7 +108,7 @@ def test_a_switch_that_is_pressed_in_the_middle_ends_homing_at_once(quiet: int, 
         right |= driven.x > HALF
         periods += right and (periods > 0 or (abs(driven.x) < 0.01 and state.motor_applied == 0))
         if periods == quiet:
-            driven.cart.physics._press_switches = lambda: setattr(driven.cart.physics, "switches", switches)
+            driven.cart.physics._press_switches = lambda x: setattr(driven.cart.physics, "switches", switches)
         assert periods <= quiet + 2
         state = driven.ask(Hello())
     assert Fault(state.fault) == Fault.HOMING | Fault(switches * Fault.LEFT_SWITCH)
