@@ -154,7 +154,7 @@ def reference_scores() -> dict[str, float]:
 
 def min_median_max(values: Sequence[float], decimals: int) -> dict[str, str]:
     """Return three table cells that summarize one figure over the seeds."""
-    found = {"min": min(values), "median": np.median(values), "max": max(values)}
+    found = {"min": np.min(values), "median": np.median(values), "max": np.max(values)}
     return {name: f"{value:.{decimals}f}" for name, value in found.items()}
 
 
