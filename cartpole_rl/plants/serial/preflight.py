@@ -12,6 +12,8 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 
+import numpy as np
+
 from cartpole_rl.errors import FaultError, PlantError
 from cartpole_rl.plants.measured import BlindMotion
 from cartpole_rl.plants.serial.cart import RESTARTED, SerialCart
@@ -49,7 +51,8 @@ SURELY_MOVED = 0.001  # m
 POLE_MOVED = 1.0  # degrees; more, where the pole still swings
 PUSH = 1.4  # m/s^2, of a push in the middle
 LONGEST_PUSH, FARTHEST_PUSH = 0.3, 0.035  # s, m
-REPEATED, LONGEST_SWING = 1.0, 2.0  # s of counts that are compared; a whole swing of a rod of 1.5 m
+FITTED, COMPARED = 2.0, 2.5  # s of counts that show a swing
+SWINGS = np.geomspace(0.4, 2.6, 120)  # s: whole swings of rods of 0.06 m to 2.5 m
 NO_SWING, LONG_PATIENCE = 0.5, 15.0  # degrees peak to peak, s
 LARGEST_DEADBAND = 150  # motor value; of nine_levels the two weakest, 100 and 150, would not move such a cart
 STEPS = 4  # for the latency, two to each side
@@ -320,18 +323,20 @@ def pole_direction(probe: Probe) -> str:
     expected, error = swinging_on(probe, [state.pole_counts for state in states], swings)
     before, enough = states[-1], max(probe.pole_counts(POLE_MOVED), no_swing + 2 * error)
     value = push_motor(probe, RIGHT)
-    for unpushed in expected:
+    passed = 0
+    while passed < len(expected):
         after = probe.drive(value)
-        swung = after.pole_counts - unpushed
+        passed = min(
+            len(expected), ticks_between(before.tick, after.tick)
+        )  # this computer may have been late
+        swung = after.pole_counts - expected[passed - 1]
         if abs(swung) >= enough or probe.metres(abs(after.cart_counts - before.cart_counts)) > FARTHEST_PUSH:
             break
     if abs(swung) < enough:
         raise NotReadyError(
             f"the pole's count does not follow a push of the cart; it changed by {swung:+d}, and swung by "
             f"{swing} before",
-            "let the pole hang still, and start again"
-            if swings
-            else "check the cable of the pole's encoder, and that the pole is screwed to its shaft",
+            "let the pole hang still, check the cable of its encoder, and that it is screwed to its shaft",
         )
     probe.centre()
     if swung < 0:
@@ -346,19 +351,24 @@ def pole_direction(probe: Probe) -> str:
 def swinging_on(probe: Probe, counts: list[int], swings: bool) -> tuple[list[int], int]:
     """Return the next counts of a pole without a push, for LONGEST_PUSH, and their error.
 
-    A swing repeats itself, after the time at which the last counts are most like earlier ones. The error is
-    the largest difference from those.
+    A small swing is a sine: the one that fits the last counts best goes on. The error is its largest
+    difference from those, and from the counts before, to which it was not fitted.
     """
-    pushed, window = probe.periods(LONGEST_PUSH), probe.periods(REPEATED)
+    pushed, last = probe.periods(LONGEST_PUSH), np.array(counts[-probe.periods(COMPARED) :])
     if not swings:
         return [counts[-1]] * pushed, 0
+    times, fitted = probe.period * np.arange(len(last) + pushed), slice(-probe.periods(FITTED), None)
 
-    def error(lag: int) -> int:
-        earlier = counts[-window - lag : -lag]
-        return max(abs(new - old) for new, old in zip(counts[-window:], earlier, strict=True))
+    def sine(seconds: float) -> np.ndarray:
+        phase = 2 * math.pi / seconds * times
+        shape = np.stack((np.ones_like(phase), np.cos(phase), np.sin(phase)), 1)
+        return shape @ np.linalg.lstsq(shape[: len(last)][fitted], last[fitted], rcond=None)[0]
 
-    lag = min(range(pushed, probe.periods(LONGEST_SWING) + 1), key=error)
-    return counts[-lag : len(counts) - lag + pushed], error(lag)
+    def error(swing: np.ndarray) -> float:
+        return np.abs(swing[: len(last)] - last).max()
+
+    best = min(map(sine, SWINGS), key=error)
+    return np.rint(best[len(last) :]).astype(int).tolist(), math.ceil(error(best))
 
 
 def deadband(probe: Probe) -> str:
