@@ -62,7 +62,7 @@ def run_command(name: str, verb: "Verb") -> None:
     schema: type[Settings] = verb.find(verb.settings)
     accept_all_characters()
     catch_signals()
-    os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra raises its errors instead of printing them
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises its errors instead of printing them
     OmegaConf.register_new_resolver("help_page", partial(help_page, name, verb, schema), replace=True)
     try:
         if "--version" in given:
@@ -111,7 +111,7 @@ def run_job(
             interrupted = isinstance(ended, (*FAILED, KeyboardInterrupt, Terminated))
             if interrupted and name in RESUMABLE and (folder / CONFIG).exists() and not has_ended(folder):
                 ended.add_note(use_of(shown(folder), name))
-            if isinstance(ended, EXPECTED):
+            if isinstance(ended, EXPECTED) and not is_job():  # a sweep goes on, and names it at its end
                 exit_with_message(name, ended)
             raise ended from None
         finally:

@@ -156,6 +156,9 @@ def check_jobs(config: DictConfig, schema: type[Settings]) -> None:
     """
     from cartpole_rl.workflows.config import TrainConfig  # a command without a sweep may need none of it
 
+    for word in OmegaConf.select(config, "hydra.overrides.hydra") or ():
+        if word.startswith("hydra.run.dir="):
+            raise ConfigError(f"{word} is the folder of one run; give that of a sweep as hydra.sweep.dir=")
     for job in jobs_of(config):
         composed = GlobalHydra.instance().config_loader().load_sweep_config(config, job)
         with read_write(composed), open_dict(composed):

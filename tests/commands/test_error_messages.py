@@ -27,12 +27,18 @@ def test_a_file_error_names_the_file_and_the_reason() -> None:
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])
 def test_a_full_disk_gets_a_remedy(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    remedy = "; make room, or give hydra.run.dir= a folder on another disk"
+    remedy = "; make room, or give hydra.run.dir= or hydra.sweep.dir= a folder on another disk"
     assert one_line(OSError(number, "is full", "last.pt"), "train") == f"last.pt: is full{remedy}"
     unnamed = "a file was not written: is full"
     assert one_line(OSError(number, "is full"), "train") == f"{unnamed}{remedy}"
     monkeypatch.setattr("sys.argv", ["cartpole-train", "resume=run"])  # its folder is given
     assert one_line(OSError(number, "is full"), "train") == f"{unnamed}; make room"
+
+
+@pytest.mark.parametrize("number", [errno.EROFS, errno.EEXIST])
+def test_a_folder_that_cannot_be_made_gets_a_remedy(number: int) -> None:
+    remedy = "give hydra.run.dir= or hydra.sweep.dir= another folder"
+    assert one_line(OSError(number, "cannot be", "sweep"), "train") == f"sweep: cannot be; {remedy}"
 
 
 @pytest.mark.parametrize("words", ["", "-m seed=0,1"])
@@ -46,6 +52,12 @@ def test_a_folder_of_runs_that_cannot_be_made_is_named(
     done = in_process("train", *words.split(), folder=tmp_path)
     remedy = "give hydra.run.dir= or hydra.sweep.dir= another folder"
     assert done.complaint == f"cartpole-train: runs/train: Read-only file system; {remedy}"
+
+
+def test_hydra_prints_no_errors_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
+    done = in_process("train", "pole=unknown", folder=tmp_path)
+    assert (done.code, "pole=unknown: there is no such choice" in done.complaint) == (2, True)
 
 
 def test_other_errors_keep_their_first_line() -> None:

@@ -1,5 +1,6 @@
 """sweep= on the command line, and jobs that fail."""
 
+import errno
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -8,6 +9,7 @@ from command_line import in_process
 from omegaconf import OmegaConf
 
 from cartpole_rl.composition import EXTRAS
+from cartpole_rl.files import write_text
 from cartpole_rl.reporting.loggers import sweep_of
 from cartpole_rl.sweeps import SweepStart, _jobs, as_multirun
 from cartpole_rl.workflows.config import TrainConfig
@@ -61,6 +63,7 @@ def test_a_sweep_is_as_its_words_after_dash_m(tmp_path: Path) -> None:
         ("-m learning.transitions=1000000,100", "learning.transitions=100 is too few"),
         ("-m learning.warmup_transitions=1000,99999999", "learning.transitions=4000000: nothing would be"),
         ("-m buffer=uniform buffer.kind=uniform,prioritized", "buffer.alpha=0: with it, buffer.kind=prior"),
+        ("-m seed=0,1 hydra.run.dir=a", "hydra.run.dir=a is the folder of one run; give that of a sweep as"),
         ("-m resume=a,b", "resume= continues one run; call cartpole-train once for each, without -m"),
     ],
 )
@@ -78,6 +81,22 @@ def test_a_defect_in_a_job_leaves_its_traceback(tmp_path: Path, monkeypatch: pyt
     assert done.err.splitlines()[-1] == "cartpole-train: 1_seed-1: ZeroDivisionError: division by zero"
     (error,) = tmp_path.glob("runs/train/*_multirun/1_seed-1/error.txt")
     assert "Traceback" in error.read_text()
+
+
+def test_a_sweep_goes_on_after_a_job_without_room_for_its_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def write(path: Path, text: str) -> None:
+        if path.parent.name == "1_seed-1":
+            raise OSError(errno.ENOSPC, "No space left on device", str(path))
+        write_text(path, text)
+
+    monkeypatch.setattr("cartpole_rl.sweeps.write_text", write)
+    words = ("-m", "seed=0,1,2", "hydra.sweep.dir=sweep")
+    done = in_process("train", *words, folder=tmp_path, function=lambda folder: (folder / "run").touch())
+    assert (done.code, (tmp_path / "sweep/2_seed-2/run").exists()) == (1, True)
+    error = tmp_path / "sweep/1_seed-1/error.txt"
+    assert f"the sweep was stopped: {error}: No space left on device; make room" in done.err.splitlines()[-1]
 
 
 @pytest.mark.parametrize("is_sweep", [True, False], ids=["sweep", "single run"])
