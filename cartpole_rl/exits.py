@@ -68,14 +68,12 @@ def one_line(error: Exception, name: str, plants: Collection[str] = ()) -> str:
     if isinstance(error, OF_HYDRA):
         if isinstance(error, OmegaConfBaseException) and (behind := error_behind(error, OSError)):
             reason = one_line(behind, name)  # of making a run folder
-            return reason if FOLDERS in reason else f"{reason}; give {FOLDERS} another folder"
+            return f"{reason}; give {FOLDERS} another folder"
         return error_message(error, name, sys.argv[1:], plants)
     if isinstance(error, OSError) and not is_defect(error):
-        remedy, keeps = "", any(word.startswith("resume=") for word in sys.argv)  # its folder
-        if error.errno in FULL:
-            remedy = "; make room" + (f", or give {FOLDERS} a folder on another disk" if not keeps else "")
-        elif error.errno in (errno.EROFS, errno.EEXIST) and not keeps:
-            remedy = f"; give {FOLDERS} another folder"
+        remedy = "; make room" if error.errno in FULL else ""
+        if remedy and not any(word.startswith("resume=") for word in sys.argv):  # which keeps its folder
+            remedy += f", or give {FOLDERS} a folder on another disk"
         return f"{error.filename or 'a file was not written'}: {error.strerror}{remedy}"
     first = reason_of(error)
     return f"{type(error).__name__}: {first}" if is_defect(error) else first

@@ -35,12 +35,6 @@ def test_a_full_disk_gets_a_remedy(number: int, monkeypatch: pytest.MonkeyPatch)
     assert one_line(OSError(number, "is full"), "train") == f"{unnamed}; make room"
 
 
-@pytest.mark.parametrize("number", [errno.EROFS, errno.EEXIST])
-def test_a_folder_that_cannot_be_made_gets_a_remedy(number: int) -> None:
-    remedy = "give hydra.run.dir= or hydra.sweep.dir= another folder"
-    assert one_line(OSError(number, "cannot be", "sweep"), "train") == f"sweep: cannot be; {remedy}"
-
-
 @pytest.mark.parametrize("words", ["", "-m seed=0,1"])
 def test_a_folder_of_runs_that_cannot_be_made_is_named(
     words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
