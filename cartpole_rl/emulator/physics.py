@@ -100,7 +100,7 @@ class CartPhysics:
         rig, half = settings.hardware or nominal_hardware(), settings.track_half_length
         self._left_stop = -half - STOP_BEHIND * rig.left_switch
         self._right_stop = half + STOP_BEHIND * rig.right_switch
-        self._has_switches = rig.switches  # end switches, as bits: 1 left, 2 right
+        self._rig_switches = rig.switches  # end switches, as bits: 1 left, 2 right
         self.switches = 0  # those that the cart presses
         numbers = settings.model_dump() | {
             "left_stop": self._left_stop,
@@ -200,11 +200,11 @@ class CartPhysics:
 
     def _press_switches(self, x: float) -> None:
         """Press the switches that the rig has, at the ends of the track."""
-        if self._has_switches:
+        if self._rig_switches:
             half = self._settings.track_half_length
             left = -x >= half - HYSTERESIS * (self.switches & 1)
             right = x >= half - HYSTERESIS * (self.switches >> 1)
-            self.switches = self._has_switches & (left + 2 * right)
+            self.switches = self._rig_switches & (left + 2 * right)
 
     def _cogging(self, x: float) -> float:
         """Return the cogging force, which pulls the cart to the nearest stable position, N."""

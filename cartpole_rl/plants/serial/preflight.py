@@ -322,12 +322,13 @@ def pole_direction(probe: Probe) -> str:
     swings = swing > no_swing
     expected, error = swinging_on(probe, [state.pole_counts for state in states], swings)
     before, enough = states[-1], max(probe.pole_counts(POLE_MOVED), no_swing + 2 * error)
-    value, passed = push_motor(probe, RIGHT), 0
-    while passed < len(expected):
+    value = push_motor(probe, RIGHT)
+    for _ in expected:
         after = probe.drive(value)
-        passed = min(len(expected), ticks_between(before.tick, after.tick))  # this computer may be late
-        swung = after.pole_counts - expected[passed - 1]
-        if abs(swung) >= enough or probe.metres(abs(after.cart_counts - before.cart_counts)) > FARTHEST_PUSH:
+        passed = ticks_between(before.tick, after.tick)  # more than one at a time if this computer is late
+        swung = after.pole_counts - expected[min(passed, len(expected)) - 1]
+        moved = probe.metres(abs(after.cart_counts - before.cart_counts))
+        if abs(swung) >= enough or moved > FARTHEST_PUSH or passed >= len(expected):
             break
     if abs(swung) < enough:
         raise NotReadyError(
