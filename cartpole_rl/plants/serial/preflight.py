@@ -51,7 +51,7 @@ SURELY_MOVED = 0.001  # m
 POLE_MOVED = 1.0  # degrees; more, where the pole still swings
 PUSH = 1.4  # m/s^2, of a push in the middle
 LONGEST_PUSH, FARTHEST_PUSH = 0.3, 0.035  # s, m
-FITTED, COMPARED = 2.0, 2.5  # s of counts that show a swing
+FITTED, COMPARED = 2.0, 2.5  # s: a sine is fitted to the last counts; its error includes earlier ones
 SWINGS = np.geomspace(0.4, 2.6, 120)  # s: whole swings of rods of 0.06 m to 2.5 m
 NO_SWING, LONG_PATIENCE = 0.5, 15.0  # degrees peak to peak, s
 LARGEST_DEADBAND = 150  # motor value; of nine_levels the two weakest, 100 and 150, would not move such a cart
@@ -315,7 +315,7 @@ def push_motor(probe: "Probe", side: int) -> int:
 def pole_direction(probe: Probe) -> str:
     """Check that a push to the right leaves the hanging pole's tip behind, on the left: its count goes up.
 
-    What the remaining swing would have done without the push is subtracted.
+    A remaining swing is assumed to go on during the push, and is subtracted.
     """
     no_swing = probe.pole_counts(NO_SWING)
     states, swing = probe.calm(no_swing, LONG_PATIENCE)
@@ -334,7 +334,7 @@ def pole_direction(probe: Probe) -> str:
         raise NotReadyError(
             f"the pole's count does not follow a push of the cart; it changed by {swung:+d}, and swung by "
             f"{swing} before",
-            "let the pole hang still, check the cable of its encoder, and that it is screwed to its shaft",
+            "let the pole hang still, check the cable of its encoder, and screw the pole tight to its shaft",
         )
     probe.centre()
     if swung < 0:
@@ -349,8 +349,8 @@ def pole_direction(probe: Probe) -> str:
 def swinging_on(probe: Probe, counts: list[int], swings: bool) -> tuple[list[int], int]:
     """Return the next counts of a pole without a push, for LONGEST_PUSH, and their error.
 
-    A small swing is a sine: the one that fits the last counts best goes on. The error is its largest
-    difference from those, and from the counts before, to which it was not fitted.
+    A small swing is a sine, which is fitted to the counts of the last FITTED seconds. The error is the
+    largest difference between that sine and the counts of the last COMPARED seconds.
     """
     pushed, last = probe.periods(LONGEST_PUSH), np.array(counts[-probe.periods(COMPARED) :])
     if not swings:
