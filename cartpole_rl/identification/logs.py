@@ -38,8 +38,10 @@ NUMBERS = re.compile(r"(?=.*\d)([-+.,;:|\s\dEe]|nan|inf)+", re.IGNORECASE)  # a 
 SLACK = 1e-6  # s, of sums of times
 FINEST = 0.01  # share of the time between rows: with a shorter period a wrong unit would fill the memory
 LONGEST_CELL = 40  # characters in a message
-LONGEST_GAP = 3  # gaps between two rows: rows further apart are missing, also where rows are resampled
+LONGEST_GAP, BRIDGED = 3, 1.5  # gaps, and periods, between rows: those further apart are not resampled
+JUMPED, FLICKER = 0.75, 5  # share of a way that is made in one step; steps of a count that flickers
 UNKNOWN, TWICE = "with an empty cell or no finite number", "that repeat the row before"
+STALLED = "for which a stalled host read a later state"
 SHORT, STANDING = "in a part that is too short", "in a part in which motor, cart or pole stand still"
 
 
@@ -76,6 +78,7 @@ class Rows(NamedTuple):
     time: Array  # [T] s, from 0
     unknown: int  # further rows, with an empty cell or a number that is not finite
     repeated: int  # further rows, the same as the one before
+    stalled: int  # further rows, for which a host that had stalled read a later state
 
     @property
     def period(self) -> float:
@@ -105,11 +108,33 @@ def read_rows(path: Path, layout: Layout) -> Rows:
     fresh, compared = np.ones(known.sum(), bool), {**columns, layout.time.name: stamps}
     fresh[1:] = ~np.logical_and.reduce([values[1:] == values[:-1] for values in compared.values()])
     columns = {name: values[fresh] for name, values in columns.items()}
-    if fresh.sum() < 2:
+    late = stalled_rows(columns[layout.position.name], columns[layout.angle.name])
+    columns = {name: values[~late] for name, values in columns.items()}
+    if (~late).sum() < 2:
         raise NotALogError(f"{path} has fewer than two rows with a number in each of {', '.join(columns)}")
-    places = np.flatnonzero(known)[fresh] + 1
-    time = times(path, stamps[fresh], layout.time, places)
-    return Rows(path, columns, places, time, int((~known).sum()), int((~fresh).sum()))
+    places = np.flatnonzero(known)[fresh][~late] + 1
+    time = times(path, stamps[fresh][~late], layout.time, places)
+    return Rows(path, columns, places, time, int((~known).sum()), int((~fresh).sum()), int(late.sum()))
+
+
+def stalled_rows(position: Array, angle: Array) -> NDArray[np.bool_]:
+    """Return the rows [T] for which a host that had stalled read a later state.
+
+    It makes up for the periods that it missed at once. So the state jumps along its motion, and stands in the
+    next rows. Only the last of these rows has the state of its time.
+    """
+    steps = np.diff(np.stack((position, angle), 1), axis=0)  # from each row to the next
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], (steps == 0).all(1), [False])).astype(int)))
+    moving = FLICKER * np.array([min(np.abs(each[each != 0]), default=0.0) for each in steps.T])
+    stalled = np.zeros(len(position), bool)
+    for first, last in edges.reshape(-1, 2):  # rows of one state, the last one included
+        if first < 2 or last == len(steps):
+            continue
+        before, jump, after = steps[first - 2], steps[first - 1], steps[last]
+        onwards = (before * jump > 0) & (after * jump > 0) & (np.abs(before) > moving)
+        missed = (1 + last - first) * (before + after) / 2  # the way of its motion in these rows
+        stalled[first:last] = (onwards & (np.abs(jump) > JUMPED * np.abs(missed))).any()
+    return stalled
 
 
 def cut_log(read: Rows, layout: Layout, encoders: Encoders, period: float) -> Log:
@@ -133,13 +158,14 @@ def cut_log(read: Rows, layout: Layout, encoders: Encoders, period: float) -> Lo
         angle = np.unwrap(angle, period=layout.angle.wraps)
     theta = signed(layout.angle.positive) * (angle - layout.angle.upright) / turn
     motor = signed(layout.motor.positive) * columns[layout.motor.name] / layout.motor.full
-    counted, left_out = np.ones(len(time), bool), {UNKNOWN: read.unknown, TWICE: read.repeated}
+    counted = np.ones(len(time), bool)
+    left_out = {UNKNOWN: read.unknown, TWICE: read.repeated, STALLED: read.stalled}
     for name, (low, high) in layout.keep.items():
         bad = (columns[name] < low) | (columns[name] > high)
         left_out[f"{name} not in {low:g} to {high:g}"] = int((bad & counted).sum())
         counted &= ~bad
     if layout.resample:
-        regular = gaps <= LONGEST_GAP * np.median(gaps)
+        regular = gaps <= max(LONGEST_GAP * np.median(gaps), BRIDGED * period)
     else:
         regular = np.abs(gaps - period) <= UNEVEN * period
     together = counted[:-1] & counted[1:] & regular
@@ -181,7 +207,7 @@ def cut_log(read: Rows, layout: Layout, encoders: Encoders, period: float) -> Lo
     left_out["alone between gaps"] = int(alone.sum())
     too_far = np.abs(np.diff(x)) > FASTEST_CART * np.maximum(gaps, period)  # stamps of a host are late
     report = Report(
-        len(time) + read.unknown + read.repeated,
+        len(time) + read.unknown + read.repeated + read.stalled,
         {reason: number for reason, number in left_out.items() if number},
         int((~regular).sum()),
         int((np.abs(motor) >= 0.999).sum()),

@@ -119,15 +119,15 @@ def identified(run: Path, friction: str | None = None, period: float = PERIOD) -
     return dynamics(found["parameters"], friction or found["cart_friction"], "bearing", period)
 
 
-def by_toolbox(fit: Path, file: Path) -> Any:
+def by_toolbox(fit: Path, file: Path, period: float = PERIOD) -> Any:
     """Return the cart that MuJoCo's toolbox finds from the windows of an identification; None without it."""
     if not toolbox.INSTALLED:
         return None
     if not file.exists():
         fitted, _ = split(recordings(fit))
-        found = toolbox.fitted(cut_windows([*fitted.values()], PERIOD, most=WINDOWS), PERIOD)
+        found = toolbox.fitted(cut_windows([*fitted.values()], period, most=WINDOWS), period)
         write_json(file, {"parameters": found, "at_bounds": toolbox.at_bounds(found)})
-    return toolbox.MujocoCart.of(read_json(file)["parameters"], PERIOD)
+    return toolbox.MujocoCart.of(read_json(file)["parameters"], period)
 
 
 def away(windows: Windows) -> NDArray[np.bool_]:
@@ -136,7 +136,7 @@ def away(windows: Windows) -> NDArray[np.bool_]:
     return np.isfinite(motion).all((0, 1)) & is_away(motion[:, 1].T)
 
 
-def figures(windows: Windows, prediction: Prediction) -> dict[str, Any]:
+def figures(windows: Windows, prediction: Prediction, period: float = PERIOD) -> dict[str, Any]:
     """Return errors in mm and degrees: RMS of a second away from upright, and at TIMES in all stretches."""
     found: dict[str, Any] = {}
     chosen = away(windows)
@@ -145,7 +145,7 @@ def figures(windows: Windows, prediction: Prediction) -> dict[str, Any]:
         sizes = np.sqrt((error[:, chosen] ** 2).mean(0))
         found[f"away_{name}"] = [float(np.percentile(sizes, share)) for share in (50, 90)]
         for label, kept in (("all", np.full(len(chosen), True)), ("away", chosen)):
-            found[f"{label}_at_{name}"] = at_times(error[:, kept], PERIOD)
+            found[f"{label}_at_{name}"] = at_times(error[:, kept], period)
         if prediction.spread.any():
             within = np.abs(error) <= CERTAIN * factor * prediction.spread[:, channel]
             found[f"within_{name}"] = float(within[1:, chosen].mean())

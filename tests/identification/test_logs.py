@@ -290,6 +290,26 @@ def test_rows_without_a_number_and_repeated_ones_are_left_out(
     assert log.report.left_out == expected
 
 
+@pytest.mark.parametrize("resample", [False, True])
+def test_rows_for_which_a_stalled_host_read_a_later_state_are_left_out(
+    read: Read, motion: Columns, resample: bool
+) -> None:
+    """Such a host reads one state for all rows that it missed; the last of them has the state of its time."""
+    columns = {name: values.copy() for name, values in motion.items()}
+    stalled = [slice(400, 402), slice(700, 701)]
+    for rows in stalled:
+        for name in ("x", "a"):
+            columns[name][rows] = columns[name][rows.stop]
+    log = read(columns, resample=resample)
+    assert log.report.left_out == {"for which a stalled host read a later state": 3}
+    assert [part.steps for part in log.parts] == ([STEPS - 1] if resample else [399, 297, STEPS - 702])
+    if resample:  # on lines between the rows
+        assert np.abs(wrap(log.parts[0].theta - motion["a"])).max() < 0.1
+    standing = {**columns, "a": np.round(columns["a"], 1)}  # too coarse: it stands between its counts
+    standing["x"] = np.round(columns["x"], 2)
+    assert not read(standing, resample=resample).report.left_out
+
+
 def test_the_time_since_the_row_before_can_be_kept_within_bounds(read: Read, motion: Columns) -> None:
     """A standing cart and a constant gap are no repeated row."""
     columns = {name: np.concatenate((values, np.full(100, values[-1]))) for name, values in motion.items()}
