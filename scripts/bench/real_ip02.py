@@ -46,8 +46,17 @@ from cartpole_rl.run_folder import IDENTIFIED
 Array = NDArray[np.float64]
 FIRST, OTHER = (Path("Testing", f"data_18-06-2020_{time}.mat") for time in ("14-21_44", "17-32_26"))
 PERIOD, FITTED = 0.025, 70.0  # s
-CART = Path(__file__).with_name("ip02_amplifier.yaml")
-RIG = (f"cart={CART}", "pole=medium")
+CART = """\
+# Quanser's IP02 behind Quanser's amplifier; a motor value of 250 is 10 V. Numbers by the owners of the recordings,
+# in functions/getParameters.m of their repository.
+defaults: [ip02]
+cart_mass: 0.499      # kg: 0.38, and 0.119 of the motor's rotor, eta_g K_g^2 J_m / r_mp^2
+cart_viscous: 9.11    # N s/m: 4.3, and 4.81 of the back-EMF, eta_g eta_m K_g^2 k_t k_m / (R_m r_mp^2)
+force_linear: 0.0429  # N per motor value: eta_g eta_m K_g k_t / (R_m r_mp) = 1.072 N per volt
+force_offset: 0.0     # N
+motor_offset: 0
+motor_per_newton: 23.3  # 1 / force_linear
+"""
 LATENCY = 0.025  # s: the motion follows the voltage by about a period
 PUBLISHED = {"pole_viscous": 2.4e-3, "pole_com": 0.16825, "pole_inertia": 1.2e-3, "pole_mass": 0.127}
 NO_FRICTION = {"cart_coulomb": 0.0, "pole_drag": 0.0}  # theirs is viscous
@@ -86,19 +95,19 @@ def write_log(path: Path, columns: Mapping[str, Array]) -> None:
     write_text(path, "\n".join((",".join(columns), *lines)) + "\n")
 
 
-def imported(run: Path, logs: Mapping[str, Mapping[str, Array]]) -> Path:
+def imported(run: Path, cart: Path, logs: Mapping[str, Mapping[str, Array]]) -> Path:
     """Return the run folder of `cartpole-import` with logs."""
     beside = run.with_name(f"{run.name}-logs")
     for name, columns in logs.items():
         write_log(beside / f"{name}.csv", columns)
-    words = (f"from={beside}", "layout=ip02_2020", RIG[0])
+    words = (f"from={beside}", "layout=ip02_2020", f"cart={cart}")
     return run_once(run, "import", *words, result="import.json")
 
 
-def owners() -> Dynamics:
+def owners(cart: Path) -> Dynamics:
     """Return the cart of the owners' numbers."""
     pole = Pole(**choice("pole/medium")["choices"]["medium"]).model_dump()
-    numbers = {**parameters_of(load("cart", CART).values), **pole, **PUBLISHED, **NO_FRICTION}
+    numbers = {**parameters_of(load("cart", cart).values), **pole, **PUBLISHED, **NO_FRICTION}
     return dynamics({**numbers, "latency": LATENCY}, "linear", "exponential", PERIOD)
 
 
@@ -112,9 +121,12 @@ def main() -> None:
     first, other = log_of(options.folder / FIRST), log_of(options.folder / OTHER)
     early = first["time"] < FITTED
     parts = [{name: values[rows] for name, values in first.items()} for rows in (early, ~early)]
-    fit = imported(home / "fit", {"14-21": parts[0]})
-    report = imported(home / "report", {"14-21": parts[1], "17-32": other})
-    words = (f"from={fit}", *RIG)
+    cart = home / "ip02_amplifier.yaml"
+    home.mkdir(parents=True, exist_ok=True)
+    write_text(cart, CART)
+    fit = imported(home / "fit", cart, {"14-21": parts[0]})
+    report = imported(home / "report", cart, {"14-21": parts[1], "17-32": other})
+    words = (f"from={fit}", f"cart={cart}", "pole=medium")
     period = f"control_period={PERIOD}"
     own = run_once(home / "identify", "identify", *words, period, result=IDENTIFIED)
     step = run_once(home / "one_step", "identify", *words, period, "method=one_step", result=IDENTIFIED)
@@ -122,7 +134,7 @@ def main() -> None:
     learned = load_model(model)
     physics = Dynamics.of(learned.parameters, learned.models, learned.period, learned.substeps)
     carts = {
-        OWNERS: owners(),
+        OWNERS: owners(cart),
         ONE_STEP: identified(step, "step", PERIOD),
         TOOLBOX: by_toolbox(fit, home / "toolbox.json", PERIOD),
         PHYSICS: identified(own, period=PERIOD),
@@ -132,7 +144,7 @@ def main() -> None:
     results: dict[str, Any] = {}
     for log in ("14-21", "17-32"):
         windows = stretches((each for name, each in recorded.items() if name.startswith(log)), PERIOD)
-        found = {name: predict(windows, cart) for name, cart in carts.items() if cart is not None}
+        found = {name: predict(windows, each) for name, each in carts.items() if each is not None}
         found[RESIDUAL] = predict(windows, physics, learned.residual.as_type(torch.float64))
         results[log] = {name: figures(windows, each, PERIOD) for name, each in found.items()}
         print(f"\n{log}: {windows.number} seconds, {away(windows).sum()} of them away from upright")
