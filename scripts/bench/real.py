@@ -119,15 +119,15 @@ def identified(run: Path, friction: str | None = None, period: float = PERIOD) -
     return dynamics(found["parameters"], friction or found["cart_friction"], "bearing", period)
 
 
-def by_toolbox(fit: Path, file: Path, period: float = PERIOD) -> Any:
+def by_toolbox(fit: Path, file: Path) -> Any:
     """Return the cart that MuJoCo's toolbox finds from the windows of an identification; None without it."""
     if not toolbox.INSTALLED:
         return None
     if not file.exists():
         fitted, _ = split(recordings(fit))
-        found = toolbox.fitted(cut_windows([*fitted.values()], period, most=WINDOWS), period)
+        found = toolbox.fitted(cut_windows([*fitted.values()], PERIOD, most=WINDOWS), PERIOD)
         write_json(file, {"parameters": found, "at_bounds": toolbox.at_bounds(found)})
-    return toolbox.MujocoCart.of(read_json(file)["parameters"], period)
+    return toolbox.MujocoCart.of(read_json(file)["parameters"], PERIOD)
 
 
 def away(windows: Windows) -> NDArray[np.bool_]:

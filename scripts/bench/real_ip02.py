@@ -23,9 +23,7 @@ from real import (
     OWNERS,
     PHYSICS,
     RESIDUAL,
-    TOOLBOX,
     away,
-    by_toolbox,
     dynamics,
     figures,
     identified,
@@ -47,7 +45,7 @@ Array = NDArray[np.float64]
 FIRST, OTHER = (Path("Testing", f"data_18-06-2020_{time}.mat") for time in ("14-21_44", "17-32_26"))
 PERIOD, FITTED = 0.025, 70.0  # s
 CART = """\
-# Quanser's IP02 behind Quanser's amplifier; a motor value of 250 is 10 V. Numbers by the owners of the recordings,
+# Quanser's IP02 behind Quanser's amplifier; a motor value of 250 is 10 V. Numbers by the recordings' owners,
 # in functions/getParameters.m of their repository.
 defaults: [ip02]
 cart_mass: 0.499      # kg: 0.38, and 0.119 of the motor's rotor, eta_g K_g^2 J_m / r_mp^2
@@ -136,7 +134,6 @@ def main() -> None:
     carts = {
         OWNERS: owners(cart),
         ONE_STEP: identified(step, "step", PERIOD),
-        TOOLBOX: by_toolbox(fit, home / "toolbox.json", PERIOD),
         PHYSICS: identified(own, period=PERIOD),
         MODEL: physics,
     }
@@ -144,7 +141,7 @@ def main() -> None:
     results: dict[str, Any] = {}
     for log in ("14-21", "17-32"):
         windows = stretches((each for name, each in recorded.items() if name.startswith(log)), PERIOD)
-        found = {name: predict(windows, each) for name, each in carts.items() if each is not None}
+        found = {name: predict(windows, each) for name, each in carts.items()}
         found[RESIDUAL] = predict(windows, physics, learned.residual.as_type(torch.float64))
         results[log] = {name: figures(windows, each, PERIOD) for name, each in found.items()}
         print(f"\n{log}: {windows.number} seconds, {away(windows).sum()} of them away from upright")
