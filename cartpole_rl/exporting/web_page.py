@@ -229,4 +229,5 @@ def words(agent: ExportedAgent) -> dict[str, str]:
     about = agent.description
     low, high = about.pole_lengths
     lengths = f"{low:.2f} m" if low == high else f"{low:.2f} to {high:.2f} m"
-    return {"origin": html.escape(about.origin), "checksum": agent.checksum, "lengths": lengths}
+    does = "balances the pole" if about.start == Start.UPRIGHT else "swings the pole up and balances it"
+    return {"origin": html.escape(about.origin), "checksum": agent.checksum, "lengths": lengths, "does": does}

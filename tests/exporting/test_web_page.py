@@ -130,9 +130,12 @@ def test_a_balancing_agent_starts_upright_and_fails_when_the_pole_falls(
       driven.step(0);
       angles.push(Math.abs(driven.percept.state[2]));
     }
-    document.body.textContent = JSON.stringify([start, ...angles.slice(-2)]);
+    const text = document.querySelector("p").textContent + verdict()[0];
+    document.body.textContent = JSON.stringify([text, start, ...angles.slice(-2)]);
     """
-    start, before, last = in_browser(balancing_page, script, tmp_path)
+    text, start, before, last = in_browser(balancing_page, script, tmp_path)
+    assert "balances the pole." in text
+    assert "wing" not in text  # it does not swing up
     assert start == 0
     assert before <= balancing.training.task.angle_limit < last
 

@@ -72,7 +72,7 @@ function verdict() {
   if (failedAt !== null) return [cart.fallen ? "Failed: the pole fell." : "Failed: the cart left its track.", "--bad"];
   if (!real && !agentDrives()) return ["The motor is off.", "--soft"];
   if (upright > 0.5) return [`Upright for ${upright.toFixed(1)} s`, "--good"];
-  return wasUpright ? ["Recovering …", "--pole"] : ["Swinging up …", "--soft"];
+  return wasUpright ? ["Recovering …", "--pole"] : [DATA.startsUpright ? "Balancing …" : "Swinging up …", "--soft"];
 }
 
 // pictures
