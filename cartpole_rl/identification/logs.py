@@ -40,7 +40,7 @@ FINEST = 0.01  # share of the time between rows: with a shorter period a wrong u
 LONGEST_CELL = 40  # characters in a message
 LONGEST_GAP, BRIDGED = 3, 1.5  # gaps, and periods, between rows: those further apart are not resampled
 JUMPED, FLICKER = 0.75, 5  # share of a way that is made in one step; steps of a count that flickers
-UNKNOWN, TWICE = "with an empty cell or no finite number", "that repeat the row before"
+UNKNOWN, TWICE = "with an empty, missing or surplus cell, or no finite number", "that repeat the row before"
 STALLED = "for which a stalled host read a later state"
 SHORT, STANDING = "in a part that is too short", "in a part in which motor, cart or pole stand still"
 
@@ -286,6 +286,10 @@ def read_columns(path: Path, layout: Layout) -> dict[str, Array]:
             f"{path}, line {lines[longer[0]]}: it has {len(rows[longer[0]])} cells under {len(heading)} "
             "names; mend decimal= and delimiter= of the layout"
         )
+    usual = int(np.median([len(row) for row in rows]))
+    for row in rows:  # bytes were lost, so its cells may belong to other columns
+        if len(row) < usual or any(map(NUMBERS.fullmatch, row[len(heading) :])):
+            row.clear()
     return {name: _numbers(path, name, heading.index(name), rows, lines, layout) for name in wanted}
 
 

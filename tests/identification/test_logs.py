@@ -186,7 +186,7 @@ def test_an_empty_first_cell_shifts_no_row(tmp_path: Path, motion: Columns) -> N
     lines[500] = lines[500][lines[500].index("\t") :]
     (tmp_path / "log.csv").write_text("\n".join(lines))
     log = read_log(tmp_path / "log.csv")
-    assert log.report.left_out == {"with an empty cell or no finite number": 1}
+    assert log.report.left_out == {"with an empty, missing or surplus cell, or no finite number": 1}
 
 
 def parquet(path: Path, columns: Columns) -> None:
@@ -217,7 +217,7 @@ def test_a_log_of_arrays_is_as_one_of_text(tmp_path: Path, read: Read, motion: C
     unknown = {**motion, "x": np.where(np.arange(STEPS) == 2, np.nan, motion["x"])}
     ARRAYS[kind](path, unknown)
     assert read_log(path).report.left_out == {
-        "with an empty cell or no finite number": 1,
+        "with an empty, missing or surplus cell, or no finite number": 1,
         "in a part that is too short": 2,
     }
     ARRAYS[kind](path, lacking)
@@ -285,7 +285,7 @@ def test_rows_without_a_number_and_repeated_ones_are_left_out(
     path.write_text("\n".join((*lines, "12.3,0.")))  # the power failed
     log = read_log(path, time={"since": since})
     assert [part.steps for part in log.parts] == [399, *([498] if since == "start" else [298, 198]), 598]
-    unknown = "with an empty cell or no finite number"
+    unknown = "with an empty, missing or surplus cell, or no finite number"
     expected = {unknown: 4} if since == "previous_row" else {unknown: 3, "that repeat the row before": 1}
     assert log.report.left_out == expected
 
@@ -470,6 +470,17 @@ def test_a_bad_log_is_one_line(tmp_path: Path, text: str, message: str) -> None:
     path.write_text(text)
     with pytest.raises(RecordingError, match=message):
         read_log(path)
+
+
+@pytest.mark.parametrize("damaged", ["1.98,0.1,50,7", "1.98,0.0,2,0.1,3.6,98,7"])
+def test_a_line_with_a_lost_or_a_surplus_number_shifts_no_column(
+    tmp_path: Path, motion: Columns, damaged: str
+) -> None:
+    path = written(tmp_path / "log.csv", {**motion, "i": motion["u"]})
+    lines = path.read_text().splitlines()
+    lines[100] = damaged  # as where a serial line lost bytes
+    path.write_text("\n".join(lines))
+    assert [part.steps for part in read_log(path).parts] == [98, 1399]
 
 
 def test_a_point_is_no_decimal_where_a_comma_is(tmp_path: Path) -> None:
