@@ -35,6 +35,7 @@ FEW, LEAST_JUMPS = 50, 3  # values of a column that does not turn; jumps that te
 MOST_OF_RANGE, ALIKE = 0.8, 0.02  # shares of a column's range, and of a jump by which others may differ
 TURNING, STALE = 0.05 / (2 * np.pi), 1 / 3  # turns in three rows; share of such rows that repeat their states
 NUMBERS = re.compile(r"(?=.*\d)([-+.,;:|\s\dEe]|nan|inf)+", re.IGNORECASE)  # a row of them
+CLOCK = re.compile(r"\d+(:|[-/.]\d+[-/.]\d)")  # the beginning of a time of day or of a date
 SLACK = 1e-6  # s, of sums of times
 FINEST = 0.01  # share of the time between rows: with a shorter period a wrong unit would fill the memory
 LONGEST_CELL = 40  # characters in a message
@@ -272,7 +273,9 @@ def read_columns(path: Path, layout: Layout) -> dict[str, Array]:
     except (OSError, UnicodeDecodeError) as error:
         if isinstance(error, OSError):
             raise RecordingError(f"{path} cannot be read: {error.strerror}") from None
-        raise NotALogError(f"{path} cannot be read: it is not UTF-8 text; save it as UTF-8") from None
+        raise NotALogError(
+            f"{path} cannot be read: it is not UTF-8 text; unpack it, or save it as UTF-8"
+        ) from None
     (number, names), numbered = heading_and_rows(text, layout, wanted)
     if not numbered:
         raise NotALogError(f"{path} holds no rows; give a log with a line of column names")
@@ -412,10 +415,10 @@ def _numbers(
             values[index] = float(cell.replace(layout.decimal, ".") or "nan")
         except ValueError:
             shown = cell if len(cell) <= LONGEST_CELL else f"{cell[:LONGEST_CELL]}..."
-            if NUMBERS.fullmatch(cell) and ":" not in cell:
-                advice = ", or mend decimal= and delimiter= of the layout"
-            elif NUMBERS.fullmatch(cell):
+            if CLOCK.match(cell):
                 advice = f" in {layout.time.unit}" if name == layout.time.name else ""
+            elif NUMBERS.fullmatch(cell):
+                advice = ", or mend decimal= and delimiter= of the layout"
             else:
                 advice = f", leave the cell empty, or begin the line with {layout.comment}"
             raise RecordingError(f"{path}, line {line}: {name} is {shown!r}; give a number{advice}") from None

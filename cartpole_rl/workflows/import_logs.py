@@ -33,7 +33,7 @@ from cartpole_rl.identification.logs import (
     units_of_turn,
 )
 from cartpole_rl.identification.sensors import Estimate, Sensors, question_sensors
-from cartpole_rl.identification.settings import ImportConfig, Layout, log_files
+from cartpole_rl.identification.settings import SUFFIXES, ImportConfig, Layout, log_files
 from cartpole_rl.plants.measured import FASTEST_CART
 from cartpole_rl.rig.hardware import nominal_hardware
 from cartpole_rl.run_folder import RECORDINGS, write_config, write_json
@@ -86,9 +86,10 @@ def import_logs(config: ImportConfig, folder: Path) -> Sensors | None:
         raise others[0]
     for other in others:
         print_message("import", f"note: left out: {other}")
-    for path in sorted(config.source.glob("*.mcap")):
-        said = f"{path} is no log; give a recording of cartpole-export alone"
-        print_message("import", f"note: left out: {said}")
+    beside = [path for path in config.source.glob("[!.]*") if path.is_file()]
+    if kinds := {path.suffix or path.name for path in beside if path.suffix.lower() not in SUFFIXES}:
+        said = f"files of {config.source} that are no {', '.join(SUFFIXES)}: {', '.join(sorted(kinds))}"
+        print_message("import", f"note: left out: {said}; unpack or convert logs among them")
     long = {path: read for path, read in rows.items() if read.time[-1] >= config.layout.shortest} or rows
     period = config.layout.period or common_period(long, config.source)
     logs = {

@@ -454,6 +454,8 @@ def test_the_period_of_recordings_is_not_that_of_the_first(read: Read, motion: C
             "line 2: t is 's'; give a number, leave the cell empty, or begin the line with #$",
         ),
         ("t,x,a,u\n12:00:00.5,0,0,0\n", r"line 2: t is '12:00:00\.5'; give a number in s$"),
+        ("t,x,a,u\n2026-12-01T12:00,0,0,0\n", "line 2: t is '2026-12-01T12:00'; give a number in s$"),
+        ("t,x,a,u\n1.12.2026,0,0,0\n", r"line 2: t is '1\.12\.2026'; give a number in s$"),
         ("t;x;a;u\n0;0,5;0;0\n", "line 2: x is '0,5'; give a number, or mend decimal= and delimiter="),
         (
             "t,x,a,u\n0,0,0,0\n0.1,0,0,0\n0.1,1,0,0\n",
@@ -738,7 +740,7 @@ def test_a_file_beside_the_logs_is_left_out(
     written(folder / "aborted.csv", {name: values[:1] for name, values in motion.items()})
     reasons = {
         "notes.txt": " has no column t, x, a, u; it has on, Monday",
-        "measures.txt": " cannot be read: it is not UTF-8 text; save it as UTF-8",
+        "measures.txt": " cannot be read: it is not UTF-8 text; unpack it, or save it as UTF-8",
         "aborted.npz": " has fewer than two rows with a number in each of t, x, a, u",
         "aborted.csv": " has fewer than two rows with a number in each of t, x, a, u",
     }
@@ -750,12 +752,13 @@ def test_a_file_beside_the_logs_is_left_out(
     short = {name: values[:2] for name, values in motion.items()}
     written(folder / "short.csv", {**short, "t": np.array([0, 0.5])})  # of no period
     written(folder / "a.csv", motion)
-    (folder / "bag_0.mcap").write_bytes(b"of ROS 2")
-    reasons["bag_0.mcap"] = " is no log; give a recording of cartpole-export alone"
+    for other in ("bag_0.mcap", "c.csv.gz"):
+        (folder / other).write_bytes(b"of another kind")
     import_logs(imported(folder), tmp_path / "run")
     said = capsys.readouterr()
     for name, reason in reasons.items():
         assert f"note: left out: {folder / name}{reason}" in said.err
+    assert re.search(r"note: left out: files of .* that are no \.csv.*: \.gz, \.mcap; unpack", said.err)
     assert "doubt: " not in said.out
     assert {path.name[:2] for path in (tmp_path / "run/recordings").iterdir()} == {"a_"}
     written(folder / "b.csv", {"t": motion["t"], "x": motion["x"]})
