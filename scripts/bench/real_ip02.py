@@ -85,19 +85,13 @@ def series_of(series: Any) -> tuple[Array, Array]:
     return start + step * np.arange(len(values)), values
 
 
-def write_log(path: Path, columns: Mapping[str, Array]) -> None:
-    """Write columns as CSV."""
-    rows = zip(*columns.values(), strict=True)
-    lines = (",".join(f"{value:.9g}" for value in row) for row in rows)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_text(path, "\n".join((",".join(columns), *lines)) + "\n")
-
-
 def imported(run: Path, cart: Path, logs: Mapping[str, Mapping[str, Array]]) -> Path:
     """Return the run folder of `cartpole-import` with logs."""
     beside = run.with_name(f"{run.name}-logs")
+    beside.mkdir(parents=True, exist_ok=True)
     for name, columns in logs.items():
-        write_log(beside / f"{name}.csv", columns)
+        rows, heading = np.stack([*columns.values()], 1), ",".join(columns)
+        np.savetxt(beside / f"{name}.csv", rows, "%.9g", ",", header=heading, comments="")
     words = (f"from={beside}", "layout=ip02_2020", f"cart={cart}")
     return run_once(run, "import", *words, result="import.json")
 
